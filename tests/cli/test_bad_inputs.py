@@ -164,7 +164,6 @@ WORDS: list[tuple[str, str, str]] = [
     ("probe {run} ", "--probes knn knn", "twice"),
     ("probe {run} ", "--tasks patern", "did you mean 'pattern'"),
     ("probe {run} ", "--modalities sound", "--modalities"),
-    ("probe {run} ", "--imagenet {tmp}/none.pth", "{tmp}/none.pth"),
     ("probe {run} ", "--on {run}", "pack.json"),
     ("probe ", "", "run's folder"),
     ("probe ", "{tmp}/nowhere", "no trained model at {tmp}/nowhere"),

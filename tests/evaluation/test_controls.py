@@ -12,9 +12,9 @@ import pytest
 
 from mvitac.data.spec import DataSpec
 from mvitac.evaluation.classifiers import fit_knn, fit_linear
-from mvitac.evaluation.controls import borders, controls_of, start_weights, starts_of, thumbnails
+from mvitac.evaluation.controls import borders, controls_of, frozen_trunks, imagenet_trunk, starts_of, thumbnails
 from mvitac.methods.supervised import SupervisedConfig
-from mvitac.nn.encoders import SCRATCH, Encoders
+from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders
 from mvitac.recipes import recipe, with_method
 from mvitac.run import Run
 from support.toy import Toy, toy_pack
@@ -42,13 +42,22 @@ def test_the_border_sees_nothing_of_the_middle() -> None:
     assert np.array_equal(found[0], found[1]) and not np.array_equal(found[0], found[2])
 
 
-def test_start_weights_are_named_once_and_scratch_is_none() -> None:
+def test_frozen_trunks_are_imagenet_and_files_that_runs_started_from() -> None:
     run = replace(recipe("smoke"), encoder=Encoders.both(trunk="mvitac_tiny", weights=SCRATCH))
-    trained = replace(run, encoder=run.encoder.changed(weights="b.pth"))
-    assert start_weights([run, run], None) == []
-    given = run.encoder.changed(weights="a.pth")
-    assert start_weights([trained, run, trained], Path("a.pth")) == [given, trained.encoder]
-    assert start_weights([trained], Path("b.pth")) == [trained.encoder]
+    started = replace(run, encoder=run.encoder.changed(weights="b.pth"))
+    found = frozen_trunks([run, started, started], 72)
+    assert [name for name, _ in found] == ["imagenet", "start"] and found[1][1].encoder == started.encoder
+    (_, control), *rest = frozen_trunks([run], 500)
+    assert not rest and {control.encoder[m].trunk for m in ("vision", "touch")} == {"tf_efficientnet_lite0"}
+    assert {control.augment.whole_of(m) for m in ("vision", "touch")} == {128}  # as stored, up to here
+    assert frozen_trunks([run], 72)[0][1].augment.whole_of("touch") == 72
+
+
+def test_the_runs_own_trunk_is_the_imagenet_control_where_its_weights_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mvitac.nn.imagenet.source", lambda trunk: "cache" if trunk == "resnet18" else "")
+    found = imagenet_trunk(EncoderConfig(trunk="resnet18", weights=SCRATCH, locked=True))
+    assert found == EncoderConfig(trunk="resnet18")
+    assert imagenet_trunk(EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)) is None
 
 
 def test_neighbours_are_by_cosine_and_vote_in_shares() -> None:

@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from mvitac.bench.external import open_model
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
-from mvitac.evaluation.evaluate import probe
 from mvitac.nn.encoders import EncoderConfig, build_trunk
 from mvitac.nn.initial import Init
 from mvitac.nn.weights import State, load_weights, read_tensors
@@ -112,7 +111,6 @@ def from_init(file: Path, pack: Pack) -> None:
 ROUTES: dict[str, Callable[[Path, Pack, Path], Any]] = {
     "external file": lambda file, pack, run: open_model(f"external:{file},trunk={NAME}"),
     "external timm": lambda file, pack, run: open_model(f"external:timm/{NAME},weights={file}"),
-    "--imagenet": lambda file, pack, run: probe(run, imagenet=file),
     "--init": lambda file, pack, run: from_init(file, pack),
 }
 

@@ -150,7 +150,14 @@ def test_shows_every_score_of_the_probe(materials: Path, result: dict[str, Any])
     assert set(result["summary"]) == {"category", "soft", "rough", "force"}
     for task, found in result["summary"].items():
         sources = {source for cells in found.values() for source in cells}
-        assert sources == {"mvitac", "untrained", "pixels", "border", "mean" if task == "force" else "majority"}
+        assert sources == {
+            "mvitac",
+            "imagenet",
+            "untrained",
+            "pixels",
+            "border",
+            "mean" if task == "force" else "majority",
+        }
         for source in sources:
             assert shown[task, source] == [cell_text(found, source, m) for m in columns_of(found)]
 
@@ -334,7 +341,7 @@ def texts_of(records: Sequence[dict[str, Any]]) -> dict[tuple[str, ...], str]:
     cells: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for r in (r for r in records if "group_correct" in r):  # of tasks with classes
         cells.setdefault((r["task"], r["modality"], r["source"]), []).append(r)
-    assert len(cells) == 3 * (3 * 3 + 1 + 1)
+    assert len(cells) == 3 * (4 * 3 + 1 + 1)
     found = {cell: [100 * value for value in interval(records)] for cell, records in cells.items()}
     return {cell: f"{mean:.1f} [{low:.1f}, {high:.1f}]" for cell, (mean, low, high) in found.items()}
 

@@ -46,8 +46,6 @@ class _Options:
     another machine that shares the folder, takes the runs that no process has."""
     device: str = "auto"
     """auto, cpu, cuda or cuda:N; with several jobs and GPUs each job has its own."""
-    imagenet: Path | None = None
-    """ImageNet weights of the trunk (a file), for the frozen-ImageNet control."""
     dry_run: bool = False
     """Print the plan, what is finished and what is left, and stop."""
     tables_only: bool = False
@@ -87,7 +85,7 @@ def compare(argv: list[str]) -> None:
     plan = find_plan(chosen.get("--plan", "table1"))
     options = _parse(chosen, rest, plan)
     plan = _changed(plan, chosen.get("--recipe", plan.recipe), options)
-    config = ProbeConfig(probes=plan.probes, tasks=plan.tasks, modalities=plan.modalities, imagenet=options.imagenet)
+    config = ProbeConfig(probes=plan.probes, tasks=plan.tasks, modalities=plan.modalities)
     if not options.dry_run:
         check_place(options.out / "plan.json")
     works = lay_out_folds(plan, options.out, config, options.device)

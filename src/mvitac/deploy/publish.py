@@ -129,7 +129,7 @@ def _controls(model: Model, pack: Pack, records: Records) -> Records:
         sources.setdefault(tuple(r["modality"] for r in records if r["task"] == task.name), []).append(task)
     for modalities, tasks in sources.items():
         if modalities:
-            controls += controls_of([run], pack, tasks, modalities, ["linear"], None, [model.spec])[0]
+            controls += controls_of([run], pack, tasks, modalities, ["linear"], [model.spec])[0]
     return controls
 
 

@@ -5,7 +5,6 @@ Controls are the most common class, raw pixels, the image border, the dataset's 
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,16 +25,19 @@ from mvitac.evaluation.probe import (
 )
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.sensors import Standardise
+from mvitac.methods.simclr import SimCLRConfig
 from mvitac.model import Model
 from mvitac.model_files import fresh
-from mvitac.nn.encoders import SCRATCH, Encoders
+from mvitac.nn import imagenet
+from mvitac.nn.encoders import IMAGENET, SCRATCH, EncoderConfig, Encoders
 from mvitac.run import Run
 from mvitac.system.progress import work
 from mvitac.system.threads import in_threads
 
-CONTROLS = ("imagenet", "untrained", "pixels", "border", "majority", "mean")
+CONTROLS = ("imagenet", "start", "untrained", "pixels", "border", "majority", "mean")
 """Names of the controls in the order of a table. The dataset's own controls come before the last two, of which a task has
 one: the most common class, or the mean value."""
+IMAGENET_SIDE = 128  # px: the control sees stored images up to this side, though the runs may see smaller ones
 Records = list[dict[str, Any]]
 
 
@@ -59,18 +61,16 @@ def controls_of(
     tasks: Sequence[AnyTask],
     modalities: Sequence[str],
     probes: Sequence[str],
-    imagenet: Path | None = None,
     specs: Sequence[DataSpec] = (),
     standardise: tuple[Standardise, ...] = (),
 ) -> tuple[Records, Records]:
     """Score every control for ``runs``: probe records and retrieval records, each with its "source" and "seed".
 
-    ``probes`` are those of the trunks; all other controls get logistic regression. ``imagenet`` is a file of weights
-    for one more trunk. ``specs``: what the runs were trained on, where that is not ``pack``. ``standardise``: as for
-    the runs (``sensors.touch_features``), for the trunks.
+    ``probes`` are those of the trunks; all other controls get logistic regression. ``specs``: what the runs were trained
+    on, where that is not ``pack``. ``standardise``: as for the runs (``sensors.touch_features``), for the trunks.
     """
     records = label_controls(pack, tasks)
-    starts, weights = starts_of(runs, specs or [pack.spec] * len(runs)), start_weights(runs, imagenet)
+    starts, weights = starts_of(runs, specs or [pack.spec] * len(runs)), frozen_trunks(runs, pack.size)
     fitted = sum(len(probes_of(task, probes)) for task in tasks) * (len(starts) + len(weights))
     num = len(modalities) * (len(tasks) + fitted) + len(tasks) * ("touch" in modalities)
 
@@ -86,11 +86,10 @@ def controls_of(
         for (run, _), (found, ranked) in zip(starts, scored, strict=True):
             records += _named("untrained", run.seed, found)
             retrieval += _named("untrained", run.seed, ranked)
-        for encoder in weights:
-            run, spec = starts[0]
-            # A modality that starts from random weights is no control of this name, nor are both with it.
-            which = [m for m in modalities if all(encoder[own].weights != SCRATCH for own in names_in(m, pack))]
-            records += _named("imagenet", None, probed(fresh(replace(run, encoder=encoder), spec, pack.size), which))
+        for name, run in weights:
+            # A modality that starts from random weights is no control, nor are both with it.
+            which = [m for m in modalities if all(run.encoder[own].weights != SCRATCH for own in names_in(m, pack))]
+            records += _named(name, None, probed(fresh(run, pack.spec, pack.size), which))
     return records, retrieval
 
 
@@ -159,8 +158,31 @@ def starts_of(runs: Sequence[Run], specs: Sequence[DataSpec]) -> list[tuple[Run,
     return found
 
 
-def start_weights(runs: Sequence[Run], imagenet: Path | None) -> list[Encoders]:
-    """The pre-trained encoders to probe as they are: those that ``runs`` started from, and ``imagenet``."""
-    given = [runs[0].encoder.changed(weights=str(imagenet))] if imagenet else []
-    started = [e for e in (run.encoder for run in runs) if {e.vision.weights, e.touch.weights} != {SCRATCH}]
-    return list(dict.fromkeys([*given, *started]))
+def frozen_trunks(runs: Sequence[Run], stored: int) -> list[tuple[str, Run]]:
+    """The pre-trained trunks to probe as they are, by name: ImageNet's, and files that ``runs`` started from.
+
+    ImageNet is left out where no weights are installed or cached (``imagenet.source``). It sees images as large as the
+    runs do, or as they are ``stored`` [px], up to ``IMAGENET_SIDE``.
+    """
+    first = replace(runs[0], method=SimCLRConfig())  # its heads are not read; it takes any trunk and modality
+    found = {run.encoder: "start" for run in runs if {_file(run.encoder.vision), _file(run.encoder.touch)} != {""}}
+    named = [(name, replace(first, encoder=encoder)) for encoder, name in found.items()]
+    trunks = {m: imagenet_trunk(first.encoder[m]) for m in ("vision", "touch")}
+    if trunks["vision"] and trunks["touch"]:
+        sides = {m: max(first.augment.whole_of(m), min(stored, IMAGENET_SIDE)) for m in trunks}
+        views = {m: replace(first.augment.of(m), whole=side) for m, side in sides.items()}
+        pretrained = Encoders(vision=trunks["vision"], touch=trunks["touch"])
+        return [("imagenet", replace(first, encoder=pretrained, augment=replace(first.augment, **views))), *named]
+    return named
+
+
+def _file(encoder: EncoderConfig) -> str:
+    return "" if encoder.weights in (IMAGENET, SCRATCH) else encoder.weights
+
+
+def imagenet_trunk(encoder: EncoderConfig) -> EncoderConfig | None:
+    """The trunk of ``encoder`` with ImageNet weights, or one whose weights come as a package; None if none are here."""
+    for trunk in (encoder.trunk, *imagenet.PACKAGES):
+        if imagenet.source(trunk):
+            return EncoderConfig(trunk=trunk, temporal="mean" if encoder.temporal == "attention" else encoder.temporal)
+    return None

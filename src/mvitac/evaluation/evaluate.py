@@ -14,7 +14,7 @@ from mvitac.data.several import JoinedPack
 from mvitac.data.spec import AnyTask, ValueTask
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
-from mvitac.evaluation.controls import Records, controls_of, start_weights
+from mvitac.evaluation.controls import Records, controls_of, frozen_trunks
 from mvitac.evaluation.encoders import open_encoders, probe_encoders
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
 from mvitac.evaluation.probe import PROBES, probe_model, probes_of, seen_by, split_rows, with_classes
@@ -101,8 +101,6 @@ def probe_runs(
     """
     if paths or not encoders:
         _check_paths(paths)
-    elif session.imagenet:
-        raise ValueError("imagenet is the trunk of a run: give --encoder external:timm/NAME,weights=FILE instead")
     others = open_encoders(encoders, pack)
     models = [load(path, weights) for path in paths]
     names = [name + ", best" * (weights == "best") for name in names_of(paths, models)]
@@ -114,14 +112,14 @@ def probe_runs(
     _check_tasks(pack, tasks, modalities)
     # The initial weights that an artifact names may be any file or download.
     runs = [m.run.fresh() if m.foreign else m.run for m in models]
-    _check_weights(runs, session)
+    _check_weights(runs, pack, session)
     sources = check_unseen(paths, pack, tasks, allow_leak=allow_leak)
     each = [*zip(paths, models, names, sources, strict=True)]
     records, retrieval = _probe_models(each, pack, tasks, modalities, session)
     records += probe_encoders(others, tasks, modalities, session.kinds, controls=session.controls)
     if session.controls:
         specs = [m.spec for m in models]
-        found = controls_of(runs, pack, tasks, modalities, session.kinds, session.imagenet, specs, session.standardise)
+        found = controls_of(runs, pack, tasks, modalities, session.kinds, specs, session.standardise)
         records, retrieval = records + found[0], retrieval + found[1]
     result = {**_describe_data(pack, tasks), "asked": to_json(session), "models": _digests(paths, weights)}
     result |= {"encoders": [m.describe() for m, _ in others], "leaks": leaks_of([*records, *retrieval])}
@@ -275,10 +273,10 @@ def check_unseen(
     return sources
 
 
-def _check_weights(runs: Sequence[Run], session: ProbeConfig) -> None:
+def _check_weights(runs: Sequence[Run], pack: Pack, session: ProbeConfig) -> None:
     """Load the weights of the controls once, so that missing ones are found before any probe is fitted."""
-    for encoder in start_weights(runs, session.imagenet) if session.controls else ():
-        for config in {encoder.vision, encoder.touch}:
+    for _, run in frozen_trunks(runs, pack.size) if runs and session.controls else ():
+        for config in {run.encoder.vision, run.encoder.touch}:
             build_trunk(config, 3)
 
 

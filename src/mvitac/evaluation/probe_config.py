@@ -1,7 +1,6 @@
 """``ProbeConfig``: what `mvitac probe` and ``mvitac.probe`` are asked to score."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 from mvitac.evaluation import few_labels
@@ -21,10 +20,8 @@ class ProbeConfig:
     modalities: tuple[Literal["touch", "vision", "both"], ...] = ()
     """Modalities to probe. Default: all of the data."""
     controls: bool = True
-    """Score the controls, too: majority class, untrained trunk, pixels, border, and the dataset's own. --no-controls leaves
-    them out."""
-    imagenet: Path | None = None
-    """File with ImageNet weights of the trunk, for the frozen-ImageNet control."""
+    """Score the controls, too: a frozen ImageNet trunk (where weights are installed or cached), the untrained trunk, pixels,
+    border, majority class, and the dataset's own. --no-controls leaves them out."""
     fractions: tuple[float, ...] = ()
     """Also fit the linear probe on these percentages of the labels, such as 1 10."""
     standardise: tuple[Standardise, ...] = ()
@@ -40,8 +37,6 @@ class ProbeConfig:
             for value in values:
                 if values.count(value) > 1:
                     raise ValueError(f"{name} {value!r} is given twice: give it once")
-        if self.imagenet and not self.imagenet.is_file():
-            raise ValueError(f"imagenet {self.imagenet}: give a file that exists")
         if not all(0 < percent <= 100 for percent in self.fractions):
             raise ValueError(f"fractions {self.fractions}: give percentages, above 0, at most 100")
 

@@ -80,7 +80,7 @@ def columns_of(task: dict[str, Any]) -> list[str]:
 
 def sources_of(task: dict[str, Any]) -> list[str]:
     """Methods in order of appearance, then controls from the strongest idea to the weakest."""
-    last = ("imagenet", "untrained", "pixels", "border")
+    last = ("imagenet", "start", "untrained", "pixels", "border")
     found = list(dict.fromkeys(source for modality in task.values() for source in modality))
     fixed = list(task.get("none", {}))
     own = [s for s in found if s not in last and s not in fixed]

@@ -169,7 +169,7 @@ def _controls(work: Work, out: Path, session: ProbeConfig) -> tuple[Records, Rec
     if path.exists() and (kept := read_json(path, "the controls"))["key"] == key:
         return kept["records"], kept["retrieval"]
     tasks, modalities = chosen(work.pack, session)
-    records, retrieval = controls_of(runs, work.pack, tasks, modalities, session.probes, session.imagenet)
+    records, retrieval = controls_of(runs, work.pack, tasks, modalities, session.probes)
     write_json(path, {"key": key, "records": records, "retrieval": retrieval}, sealed=True)
     return records, retrieval
 

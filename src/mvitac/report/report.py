@@ -149,7 +149,7 @@ def verdicts(study: Study) -> list[str]:
     for task in list(study.result["summary"])[:1]:
         modality, own, controls = evidence.headline(study, task)
         mark = leak_mark(own.get("leak", ""))
-        names = {"untrained": "untrained trunk", "imagenet": "frozen ImageNet trunk"}
+        names = {"untrained": "untrained trunk", "imagenet": "frozen ImageNet trunk", "start": "frozen start"}
         beside = [f"{names.get(name, name)} {percent(cell['mean'])}" for name, cell in controls.items()]
         methods = study.result["summary"][task][modality]
         others = [f"{s} {percent(methods[s]['mean'])}" for s in study.sources[1:] if s in methods]

@@ -28,7 +28,7 @@ from mvitac.registry import check_range, to_json
 from mvitac.system.files import digest
 
 VERSION = 3  # version of this reader. Increase it when the same table would give another pack.
-CONTROL_NAMES = ("majority", "pixels", "border", "untrained", "imagenet")
+CONTROL_NAMES = ("majority", "pixels", "border", "untrained", "imagenet", "start")
 """Controls that every probe computes by itself."""
 MAX_TOGETHER = 1024  # rows of one video that are read in one pass, if their images fit into ``MAX_TOGETHER_BYTES``
 MAX_TOGETHER_BYTES = 600 << 20
