@@ -57,7 +57,7 @@ TRAIN = "--recipe smoke --data pack --data.path {base}/pack --augment.size 16 --
 COMMANDS = {
     "data simulate": f"data simulate materials --num 40 --touches 1 --size {SIDE} --workers 1 --quiet --out {{out}}/p",
     "data pack": f"data pack --data folder --path {{base}}/table --size {SIDE} --workers 1 --quiet --out {{out}}/p",
-    "pretrain": f"pretrain {TRAIN} --checkpoint-every 1 --log-every 1 --resume --quiet --out {{out}}/r",
+    "pretrain": f"pretrain {TRAIN} --checkpoint-every 1 --resume --quiet --out {{out}}/r",
     "finetune": "finetune {base}/run --data pack --data.path {base}/pack --lr 1e-3 --steps 2 --batch-size 8 --quiet --resume"
     " --no-from-scratch --out {out}/f",
     "adapt": "adapt {base}/run --data pack --data.path {base}/pack --steps 2 --batches 1 --quiet --resume --out {out}/r",

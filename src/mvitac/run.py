@@ -3,9 +3,9 @@
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-import tyro
+from tyro.conf import Fixed, arg
 
 from mvitac.data.spec import DataSpec
 from mvitac.datasets.base import DatasetConfig
@@ -31,11 +31,11 @@ class Optim:
     """Optimiser (paper: Adam). sgd has momentum .9."""
     lr: float = 0.03
     """Peak learning rate (paper: .03)."""
-    eps: float = 1e-7
+    eps: Fixed[float] = 1e-7
     """Epsilon of Adam (paper: 1e-7)."""
     weight_decay: float = 0.0
     """L2 penalty (adam, sgd) or decoupled weight decay (adamw). The paper gives none."""
-    decay_norms: bool = True
+    decay_norms: Fixed[bool] = True
     """Also decay biases and the parameters of BatchNorm. Current practice is not to."""
     schedule: Literal["constant", "cosine", "step", "late-step"] = "constant"
     """constant; cosine, to zero; step, x0.9 every 10 epochs from epoch 10 on; or late-step, the same from epoch 20 on (the
@@ -81,12 +81,12 @@ class Run:
         ('mvitac', 64)
     """
 
-    recipe: tyro.conf.Suppress[str] = "paper"
+    recipe: Fixed[str] = "paper"
     """Name of the recipe this run started from. For the record only."""
     method: MethodConfig = MViTacConfig()
     data: DatasetConfig
     encoder: Encoders = Encoders()
-    init: Init = Init()
+    init: Annotated[Init, arg(name="")] = Init()
     augment: Augment = Augment()
     optim: Optim = Optim()
     batch_size: int = 256
@@ -122,7 +122,7 @@ class Run:
     """Random seed of initial weights, batches, views and dropout."""
     device: str = "auto"
     """auto (a GPU if there is one), cpu, cuda or cuda:N."""
-    log_every: int = 10
+    log_every: Fixed[int] = 10
     """Steps between log lines. Each also checks that the loss is finite."""
     eval_every: int = 0
     """Steps between evaluations (linear probes, kNN, signs of collapse) on held-out groups (split val, never test). The

@@ -9,8 +9,10 @@ spoilt) and a free place for output.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
+import operator
 import os
 import pickle
 import shutil
@@ -40,6 +42,7 @@ from mvitac.methods.mvitac import MViTacConfig
 from mvitac.model import Model
 from mvitac.recipes import recipe
 from mvitac.registry import to_json
+from mvitac.run import Run
 from mvitac.system.files import write_json
 from mvitac.training.loop import train
 from mvitac.training.views import StepViews
@@ -203,24 +206,24 @@ def presses(folder: Path) -> None:
 HARMLESS_IF_HUGE = {"log_every", "eval_every", "checkpoint_every", "touches"}  # they only mean "never" or "always"
 
 
-def numbers(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """(option, annotation) of every number in a config and the configs inside it."""
-    hints = typing.get_type_hints(type(config))
+def numbers(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, bool]]:
+    """(option, annotation, whether only Python sets it) of every number in a config and the configs inside it."""
+    hints, marked = (typing.get_type_hints(type(config), include_extras=more) for more in (False, True))
     for field in dataclasses.fields(config):
         value, kind = getattr(config, field.name), hints[field.name]
         if dataclasses.is_dataclass(value):
             yield from numbers(value, f"{prefix}{field.name}.")
         elif kind in (int, float, int | None, float | None) or kind == tuple[float, float]:
-            yield f"{prefix}{field.name}", kind
+            yield f"{prefix}{field.name}", kind, marked[field.name] != kind
 
 
-def impossible(config: Any, start: str, prefix: str = "") -> Iterator[tuple[str, str]]:
-    for name, kind in numbers(config, prefix):
+def impossible(config: Any, start: str) -> Iterator[tuple[str, str]]:
+    for name, kind, fixed in numbers(config):
         whole = int in (kind, *typing.get_args(kind))
         values = ["-1", "0.5"] if whole else ["-1", "nan", "inf"]
         if whole and name.split(".")[-1] not in HARMLESS_IF_HUGE:
             values.append("1" + "0" * 30)
-        for value in values:
+        for value in values if not fixed else ():
             words = f"{value} {value}" if kind == tuple[float, float] else value
             yield f"{start} --{name.replace('_', '-')} {words}{' --steps None' * (name == 'epochs')}", name
 
@@ -236,6 +239,18 @@ def test_impossible_numbers(refused: Callable[..., str]) -> None:
     assert {"optim.lr", "augment.vision.scale", "steps", "touches"} <= {name for _, name in FIELDS}
     for command, name in FIELDS:
         assert name.split(".")[-1] in refused(command).replace("-", "_"), command
+
+
+def test_impossible_numbers_that_only_python_sets() -> None:
+    run = recipe("smoke", PackConfig(), phased=False)
+    fixed = [name for name, _, only_python in numbers(run) if only_python]
+    assert {"optim.eps", "method.hidden", "augment.touch.jitter", "data.quality"} <= set(fixed)
+    for name in fixed:
+        record = to_json(run)
+        *outer, last = name.split(".")
+        functools.reduce(operator.getitem, outer, record)[last] = -1
+        with pytest.raises(ValueError, match=last):
+            Run.load(record)
 
 
 def leaves(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:

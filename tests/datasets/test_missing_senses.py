@@ -121,7 +121,7 @@ def test_published_probes_are_of_what_is_there(holes: Pack, model: Model) -> Non
 
 
 def test_an_export_is_checked_and_calibrated_on_what_is_there(holes: Pack, model: Model, tmp_path: Path) -> None:
-    report = export(model, holes, tmp_path / "x", ExportConfig(modality="touch"))
+    report = export(model, holes, tmp_path / "x", ExportConfig(modalities=("touch",)))
     assert report["num_rows"] == len(holes.rows("test", having=("touch",))) < len(holes.rows("test"))
     examples = _examples(ExportModule(model, ("touch",)), holes)
     assert len(examples) == len(holes.rows("train", "unlabelled", having=("touch",)))

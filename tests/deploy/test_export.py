@@ -171,7 +171,7 @@ def test_int8_on_a_cpu_without_vnni(int8: Path, tmp_path: Path) -> None:
 def test_export_of_touch_alone(smoke_run: Path, pack: Pack, tmp_path: Path) -> None:
     """From a run: the probes are fitted on the way; one modality: its own probe answers."""
     out = tmp_path / "touch"
-    command = ["export", str(smoke_run), "--modality", "touch", "--out", str(out)]
+    command = ["export", str(smoke_run), "--modalities", "touch", "--out", str(out)]
     assert main([*command, "--threads", "1"]) == 0
     images = pack.images["touch"][:3]
     found = Engine(out)(touch=images)
@@ -216,7 +216,7 @@ def test_a_wrong_normalisation_is_no_export(model: Model, pack: Pack, monkeypatc
     with monkeypatch.context() as patch:
         patch.setattr(EncoderConfig, "levels", ((0.5,) * 3, (0.225,) * 3))
         wrong = ExportModule(model)
-    with pytest.raises(ValueError, match=r"not the trained model: embedding_vision has cosine .*--min-cosine"):
+    with pytest.raises(ValueError, match=r"not the trained model: embedding_vision has cosine .*min_cosine"):
         check(model, wrong, pack)
 
 
@@ -283,7 +283,7 @@ def test_impossible_requests_are_refused_first(
     model: Model, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(ValueError, match="no smell encoder"):
-        export(model, pack, tmp_path / "x", ExportConfig(modality="smell"))  # type: ignore[arg-type]
+        export(model, pack, tmp_path / "x", ExportConfig(modalities=("smell",)))  # type: ignore[arg-type]
     larger = toy_pack(tmp_path / "p", size=40)
     for given, calibrate, config in ((larger, None, ExportConfig()), (pack, larger, ExportConfig(precision="int8"))):
         with pytest.raises(ValueError, match="p cannot check this model"):

@@ -186,7 +186,7 @@ def test_what_cannot_be_shown_is_refused(model: Model, old: Pack, new: Pack, tmp
     cases: list[tuple[Pack, ExportConfig, str]] = [
         (old, ExportConfig(), "no sensor but digit, mini"),
         (few, ExportConfig(), "needs 32 of different presses.*--new-sensor out"),
-        (new, ExportConfig(modality="vision"), "about touch"),
+        (new, ExportConfig(modalities=("vision",)), "about touch"),
     ]
     for pack, config, why in cases:
         with pytest.raises(ValueError, match=why):

@@ -73,9 +73,9 @@ def test_find_command_draws_what_it_found(
     known: Path, artifact: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Image.fromarray(pack.images["touch"][11]).save(tmp_path / "q.png")
-    of = ["--model", str(artifact), "--in", str(known)]
-    command = ["find", str(tmp_path / "q.png"), *of, "--to", "touch", "--k", "3", "--json", str(tmp_path / "f.json")]
-    assert main([*command, "--picture", str(tmp_path / "found.png")]) == 0
+    of = ["--model", str(artifact), "--known", str(known)]
+    command = ["find", str(tmp_path / "q.png"), *of, "--to", "touch", "--num", "3", "--json", str(tmp_path / "f.json")]
+    assert main([*command, "--sheet", str(tmp_path / "found.png")]) == 0
     shown, found = capsys.readouterr().out, json.loads((tmp_path / "f.json").read_text())["found"]
     assert "1.000" in shown and pack.column("id")[11] in shown and found[0]["row"] == 11
     with Image.open(tmp_path / "found.png") as sheet:
@@ -98,8 +98,8 @@ def test_find_subtracts_the_background(
     raw = 2 * (row - 128) + free
     Image.fromarray(raw.astype(np.uint8)).save(tmp_path / "raw.png")
     Image.fromarray(free).save(tmp_path / "free.png")
-    command = ["find", str(tmp_path / "raw.png"), "--model", str(artifact), "--in", str(known)]
-    command += ["--to", "touch", "--k", "1"]
+    command = ["find", str(tmp_path / "raw.png"), "--model", str(artifact), "--known", str(known)]
+    command += ["--to", "touch", "--num", "1"]
     background = ["--background", str(tmp_path / "free.png")]
     load = mvitac.load
 
@@ -118,11 +118,11 @@ def test_find_subtracts_the_background(
 
 def test_the_file_holds_what_the_model_gives(artifact: Path, model: Model, pack: Pack, tmp_path: Path) -> None:
     out = tmp_path / "x.parquet"
-    assert main(["embed", str(pack.path), "--model", str(artifact), "--out", str(out), "--splits", "test"]) == 0
-    table, rows = pq.read_table(out), pack.rows("test")
-    assert table.column("id").to_pylist() == pack.column("id")[rows].tolist()
-    assert table.column("row").to_pylist() == rows.tolist()
-    expected = model.embed(touch=pack.images["touch"][rows])["touch"].numpy()
+    assert main(["embed", str(pack.path), "--model", str(artifact), "--out", str(out)]) == 0
+    table = pq.read_table(out)
+    assert table.column("id").to_pylist() == pack.column("id").tolist()
+    assert table.column("row").to_pylist() == list(range(pack.num))
+    expected = model.embed(touch=pack.images["touch"])["touch"].numpy()
     np.testing.assert_allclose(np.stack(table.column("touch").to_numpy()), expected, atol=1e-4)
 
 
@@ -137,9 +137,9 @@ def test_a_changed_file_or_another_models_is_refused(known: Path, tmp_path: Path
 
 
 def test_by_features_only_like_finds_like(pack: Pack, tmp_path: Path, model: Model) -> None:
-    embed(model, pack, tmp_path / "x.parquet", ("test",))
+    embed(model, pack, tmp_path / "x.parquet")
     known, row = Embeddings(tmp_path / "x.parquet", model.weights_digest()), int(pack.rows("test")[3])
-    assert known.find(model, pack.images["touch"][row], "touch", "touch", 1)[0].tolist() == [[3]]
+    assert known.find(model, pack.images["touch"][row], "touch", "touch", 1)[0].tolist() == [[row]]
     with pytest.raises(ValueError, match="touch finds no vision: embed with --shared"):
         known.find(model, pack.images["touch"][row], "touch", "vision", 1)
 

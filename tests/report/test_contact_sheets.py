@@ -91,7 +91,6 @@ def test_the_command_writes_a_picture(pack: Pack, tmp_path: Path, monkeypatch: p
     ("options", "says"),
     [
         (["--out", "s.gif"], "ends in .png"),
-        (["--side", "4"], "give 16 to 1024 pixels"),
         (["--num", "0"], "give at least 1"),
         (["--by", "nothing"], "unknown task or column 'nothing'"),
         (["--seed", "-1"], "give a number >= 0"),

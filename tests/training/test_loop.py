@@ -195,7 +195,7 @@ def test_dropout_and_sgd_resume_too(pack: Pack, tmp_path: Path) -> None:
 
 
 def command(pack: Pack, out: Path) -> list[str]:
-    fields = ["--checkpoint-every", "1", "--eval-every", "0", "--log-every", "1", "--quiet"]
+    fields = ["--checkpoint-every", "1", "--eval-every", "0", "--quiet"]
     choice = ["--recipe", "smoke", "--data", "pack", "--data.path", str(pack.path)]
     return ["pretrain", *choice, *fields, "--out", str(out), "--resume"]
 

@@ -7,6 +7,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from tyro.conf import Fixed
+
 from mvitac.bench.external import ExternalModel
 from mvitac.bench.result import GUESS, read_result, sign, write_result
 from mvitac.bench.score import Entry, score_suite
@@ -34,14 +36,14 @@ class About:
     """Licence of the weights. Default: that of the adapter of an external encoder."""
     trained_on: str = ""
     """Names of all data that it was trained on. Default: what its run or its adapter says."""
-    images_seen: int = 0
+    images_seen: Fixed[int] = 0
     """Images that it saw in training, with repeats. Default: steps x batch size of its run."""
 
     def __post_init__(self) -> None:
         if self.name in (*CONTROLS, GUESS):
             raise ValueError(f"--name {self.name} is the name of a control: give another")
         if self.images_seen < 0:
-            raise ValueError(f"--images-seen {self.images_seen}: give the number of images, 1 or more")
+            raise ValueError(f"images_seen {self.images_seen}: give the number of images, 1 or more")
 
 
 def run_bench(places: Sequence[str], suite: Suite, out: Path, root: Path | None, about: About) -> Path:

@@ -193,10 +193,6 @@ class _ShowOptions:
     """Show rows of train, val, test or unlabelled only."""
     num: int = 6
     """Pairs per strip, of different groups if there are enough."""
-    limit: int = 40
-    """Maximum number of strips."""
-    side: int = 96
-    """Height of a picture in pixels."""
     seed: int = 0
     """Seed of the draw."""
     out: Path | None = None
@@ -209,16 +205,13 @@ def show(argv: list[str]) -> None:
     out = options.out or Path(f"{'-'.join(Path(one).resolve().name for one in options.pack) or 'pack'}.png")
     if out.suffix.lower() != ".png":
         raise ValueError(f"--out {out}: the sheet is a PNG, give a name that ends in .png")
-    if not 16 <= options.side <= 1024:
-        raise ValueError(f"--side {options.side}: give 16 to 1024 pixels")
     if options.seed < 0:
         raise ValueError(f"--seed {options.seed}: give a number >= 0")
     from mvitac.report import contact_sheet
 
     check_place(out)
     pack = open_packs(options.pack)
-    drawn = {"num": options.num, "limit": options.limit, "seed": options.seed}
-    found, num_all = contact_sheet.strips(pack, options.by, split=options.split, **drawn)
-    picture = contact_sheet.to_image(pack, found, num_all, side=options.side)
+    found, num_all = contact_sheet.strips(pack, options.by, split=options.split, num=options.num, seed=options.seed)
+    picture = contact_sheet.to_image(pack, found, num_all)
     write_atomic(out, lambda file: picture.save(file, "PNG"))
     print(f"{out}: {len(found)} of {num_all} strips")

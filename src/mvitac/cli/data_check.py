@@ -13,9 +13,9 @@ from mvitac.cli.options import check_json, parse, printed_to, save_json, selecto
 from mvitac.data.checks.examine import Draw, examine_open, examine_pack, examine_source, nothing
 from mvitac.data.checks.finding import Finding, exit_code
 from mvitac.data.pack import Pack
-from mvitac.data.spec import Window
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.mix import open_packs
+from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.registry import default
 from mvitac.report.contact_sheet import suspicious
@@ -40,14 +40,13 @@ class _Options:
 @dataclass(frozen=True, kw_only=True)
 class _PackOptions(_Options):
     pack: Positional[tuple[str, ...]]
-    """Folder of the pack, or of several (FOLDER or NAME=FOLDER) as one; for a source that is not packed yet: mvitac data
-    check --data NAME ..."""
-    num_frames: int = 1
-    """Also check that the pack has windows of so many frames: their rate, gaps and length."""
-    stride: float = 1.0
-    """Distance of these frames, in units of --order."""
-    order: str | None = None
-    """Column that orders the frames of a touch; default: frame, seq or time."""
+    """Folder of the pack, or of several (FOLDER or NAME=FOLDER) as one. Its windows of frames: --data pack --path FOLDER
+    --num-frames N. A source that is not packed yet: --data NAME ..."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _WindowOptions(_Options):
+    data: Annotated[PackConfig, tyro.conf.arg(name="")] = PackConfig()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,8 +54,6 @@ class _SourceOptions(_Options):
     data: Annotated[DatasetConfig, tyro.conf.arg(name="")]
     items: int = 0
     """Number of items to read, evenly spread over the source; 0 = all."""
-    thumbnail: int = 64
-    """Side in pixels to which images are reduced for the examination."""
     quiet: bool = False
     """No progress bar."""
 
@@ -66,13 +63,16 @@ def check(argv: list[str]) -> int:
     chosen, rest = selectors(argv, ("--data",))
     if "--data" not in chosen:
         options = parse(_PackOptions, rest, "data check", description=_MANUAL)
-        window = Window(frames=options.num_frames, stride=options.stride, order=options.order)
-        single = len(options.pack) == 1
         name = " + ".join(options.pack)
-        given = window, _sheet(name, options)
-        found = examine_pack(options.pack[0], *given) if single else examine_open(open_packs(options.pack), *given)
-        return _report(name, found, options)
+        draw_sheet = _sheet(name, options)
+        if len(options.pack) == 1:
+            return _report(name, examine_pack(name, draw=draw_sheet), options)
+        return _report(name, examine_open(open_packs(options.pack), draw=draw_sheet), options)
     name = f"--data {chosen['--data']}"
+    if chosen["--data"] == PackConfig.name:
+        options = parse(_WindowOptions, short(rest), f"data check {name}", description=_MANUAL)
+        found = examine_pack(options.data.path, options.data.frame_window(), _sheet(name, options))
+        return _report(str(options.data.path), found, options)
     usual = _SourceOptions(data=default(DatasetConfig, chosen["--data"]))
     options = parse(_SourceOptions, short(rest), f"data check {name}", default=usual, description=_MANUAL)
     draw_sheet = _sheet(name, options)
@@ -81,7 +81,7 @@ def check(argv: list[str]) -> int:
     data: Any = options.data
     # A leak is a finding here, beside all the others; packing refuses it.
     source = (replace(data, allow_leak=True) if isinstance(data, RowsConfig) else data).source()
-    asked: Any = {"num": options.items, "size": options.thumbnail, "workers": data.workers, "quiet": options.quiet}
+    asked: Any = {"num": options.items, "workers": data.workers, "quiet": options.quiet}
     asked |= {"window": data.frame_window(), "draw": draw_sheet}
     return _report(name, examine_source(source, **asked), options)
 

@@ -45,7 +45,7 @@ def parse(
             if {"-h", "--help"} & set(argv):
                 # A flag is shown in the one form that changes something; --x and --no-x are both accepted.
                 with _joined_lines():
-                    return tyro.cli(kind, **options, config=(tyro.conf.FlagCreatePairsOff,))  # type: ignore[arg-type]
+                    return tyro.cli(kind, **options, config=(tyro.conf.FlagCreatePairsOff, tyro.conf.SuppressFixed))  # type: ignore[arg-type]
             with _columns("10000"):  # the lines of an error must not be wrapped
                 return tyro.cli(kind, **options)  # type: ignore[arg-type]
     except SystemExit as exit_:

@@ -1,6 +1,5 @@
 """``mvitac pretrain``."""
 
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -33,7 +32,6 @@ class _Options:
 def pretrain(argv: list[str]) -> None:
     """mvitac pretrain --data D|--from run.json [--method M] [--recipe R] [--init RUN] [fields] --out DIR [--resume]"""
     chosen, rest = selectors(argv, ("--method", "--data", "--recipe", "--from", "--logger"))
-    rest = [re.sub(r"^--init(?==|$)", "--init.path", word) for word in rest]
     base = _chosen_run(chosen, phased=False)
     if not asks_help(rest) and not {"--data", "--from"} & chosen.keys():
         raise ValueError(

@@ -33,8 +33,6 @@ class _EmbedOptions:
     """Folder of a run or an artifact, or owner/name on the Hub."""
     out: Path
     """The parquet file."""
-    splits: tuple[str, ...] = ()
-    """Only these splits (train, val, test, unlabelled); none given = all."""
     shared: bool = False
     """Unit vectors of the space that both modalities share, where touch finds vision, instead of features."""
 
@@ -51,7 +49,7 @@ def embed(argv: list[str]) -> None:
     model = load(options.model)
     pack = as_trained(model, Pack(options.pack))
     with shown():
-        table = embed(model, pack, options.out, options.splits, shared=options.shared)
+        table = embed(model, pack, options.out, shared=options.shared)
     print(
         f"{options.out}: {table.num_rows} rows of {' and '.join(m for m in model.encoders if m in table.column_names)}"
     )
@@ -67,7 +65,7 @@ class _FindOptions:
     """Picture files; a two-sensor touch is two files, left then right."""
     model: str
     """The model that embedded the pairs."""
-    known: Annotated[Path, tyro.conf.arg(name="in")]
+    known: Path
     """File of mvitac embed; --shared, if touch is to find vision."""
     source: Annotated[Literal["touch", "vision"], tyro.conf.arg(name="from")] = "touch"
     """Modality of the picture."""
@@ -76,28 +74,28 @@ class _FindOptions:
     background: tuple[Path, ...] = ()
     """For a model of difference images: the touch sensor without contact, as many files as the picture. Without it the
     picture must be a difference image already."""
-    k: int = 5
+    num: int = 5
     """How many to find."""
     json: Path | None = None
     """Also write what was found to this file; - = stdout, and the table to stderr."""
-    picture: Path | None = None
+    sheet: Path | None = None
     """Also draw the query and what was found, side by side, into this PNG (needs the pack at its old path)."""
 
 
 def find(argv: list[str]) -> None:
-    """mvitac find IMAGE --model M --in FILE.parquet [--from touch] [--to vision] [--json FILE]"""
+    """mvitac find IMAGE --model M --known FILE.parquet [--from touch] [--to vision] [--json FILE]"""
     options = parse(_FindOptions, argv, "find")
     from mvitac.deploy.artifact import load
     from mvitac.deploy.search import Embeddings
 
     if not options.image:
-        raise ValueError("name the picture to search for: mvitac find IMAGE --model M --in FILE")
+        raise ValueError("name the picture to search for: mvitac find IMAGE --model M --known FILE")
     check_json(options.json)
-    check_json(options.picture, "--picture")
+    check_json(options.sheet, "--sheet")
     model = load(options.model)
     known = Embeddings(options.known, model.weights_digest())
     query, background = _picture(options.image), _picture(options.background) if options.background else None
-    rows, cosines = known.find(model, query, options.source, options.target, options.k, background=background)
+    rows, cosines = known.find(model, query, options.source, options.target, options.num, background=background)
     found = [
         {
             "cosine": round(float(cosine), 6),
@@ -113,11 +111,11 @@ def find(argv: list[str]) -> None:
     title = f"{options.source} -> {options.target} in {options.known}"
     print(title, table, "", sep="\n", file=printed_to(options.json))
     save_json(options.json, {"from": options.source, "to": options.target, "found": found})
-    if options.picture:
+    if options.sheet:
         pack = Pack(known.pack, verify=False)
         if pack.digest != known.pack_digest:
             raise ValueError(f"{pack.path} is another pack than the one that was embedded: embed it again")
-        _draw(options.picture, [query, *(pack.images[options.target][one["row"]] for one in found)])
+        _draw(options.sheet, [query, *(pack.images[options.target][one["row"]] for one in found)])
 
 
 def _picture(files: Sequence[Path]) -> np.ndarray:

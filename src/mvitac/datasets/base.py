@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from tyro.conf import Fixed
+
 from mvitac.data.pack import Pack
 from mvitac.data.spec import QUALITY, Store, Window, check_request, stored_as
 from mvitac.data.windows import windowed
@@ -36,7 +38,7 @@ class DatasetConfig(Registered):
     """Number of processes for packing; 0 = one per core."""
     store: Store = "raw"
     """Store images as raw pixels, which are fast to read, or as jpeg, which needs less disk and is decoded in every step."""
-    quality: int = QUALITY
+    quality: Fixed[int] = QUALITY
     """JPEG quality, 1 to 100. At 95, pixels differ by 1 or 2 of 255 levels. Colours keep full resolution (4:4:4)."""
 
     num_frames: int = 1
@@ -47,7 +49,7 @@ class DatasetConfig(Registered):
     """Images that show several frames; the others show the current one."""
     order: str | None = None
     """Column that orders the frames of a touch; default: frame, seq or time."""
-    short: Literal["repeat", "leave-out"] = "repeat"
+    short: Fixed[Literal["repeat", "leave-out"]] = "repeat"
     """What is done with rows near the start of a touch: repeat its first frame, or leave the row out."""
     minus_first: bool = False
     """Show (frame - first frame of the touch) / 2 + 128 instead of the frame."""

@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 import safetensors.numpy
 import torch
+from tyro.conf import Fixed
 
 from mvitac.data.pack import Pack
 from mvitac.deploy.artifact import preprocessing
@@ -49,9 +50,9 @@ class ExportConfig:
     precision: Precision = "fp32"
     """Arithmetic. bf16: by OpenVINO, on a CPU that computes it. int8: 8-bit activations, with ranges from train rows of the
     pack, and 7-bit weights, for any CPU."""
-    modality: Literal["both", "vision", "touch"] = "both"
-    """Inputs of the export; both = all the model has."""
-    min_cosine: float | None = None
+    modalities: tuple[Literal["vision", "touch"], ...] = ()
+    """Inputs of the export. Default: all that the model has."""
+    min_cosine: Fixed[float | None] = None
     """Lowest cosine of any single embedding with the original (default: .9999 for fp32, .99 for bf16, .95 for int8)."""
     accuracy_loss: float = 0.5
     """Points of accuracy (percent) that any one task may lose on the test rows."""
@@ -92,7 +93,7 @@ def export(
     """
     if config.precision == "bf16" and not has_bf16(torch.device("cpu")):
         raise ValueError("--precision bf16: this CPU does not compute bf16 itself, so the export could not be checked")
-    asked = tuple(model.encoders) if config.modality == "both" else (config.modality,)
+    asked = tuple(sorted(config.modalities, reverse=True)) or tuple(model.encoders)  # vision, touch
     known, pack = pack, new or pack
     if new and "touch" not in asked:
         raise ValueError(f"{NEW_SENSOR} is about touch, which this export lacks: leave it out")

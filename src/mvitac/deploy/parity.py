@@ -63,9 +63,7 @@ def parity(
         values = cosines(found[name], wanted[name])
         report["cosine"][name] = {"min": float(values.min()), "mean": float(values.mean())}
         if not values.min() >= min_cosine:
-            how = (
-                f"{name} has cosine {values.min():.4f} on real inputs, at least {min_cosine} is allowed (--min-cosine)"
-            )
+            how = f"{name} has cosine {values.min():.4f} on real inputs, at least {min_cosine} is allowed (min_cosine)"
             raise ValueError(f"the export is not the trained model: {how}")
     for task, known in graph.classes.items():
         labels = labels_of(pack, task, known, rows)

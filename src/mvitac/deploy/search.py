@@ -39,11 +39,11 @@ def check_pack(model: Model, pack: Pack) -> tuple[str, ...]:
     return names
 
 
-def embed(model: Model, pack: Pack, file: Path, splits: tuple[str, ...] = (), *, shared: bool = False) -> pa.Table:
-    """Write the embeddings of a pack, or of its ``splits``: features, or unit vectors of the ``shared`` space."""
-    rows = pack.rows(*splits) if splits else np.arange(pack.num)
+def embed(model: Model, pack: Pack, file: Path, *, shared: bool = False) -> pa.Table:
+    """Write the embeddings of a pack: features, or unit vectors of the ``shared`` space."""
+    rows = np.arange(pack.num)
     names = ["id", "group", "split", *(f"label_{task.name}" for task in pack.spec.tasks)]
-    table = pack.table.select(names).take(rows).append_column("row", pa.array(rows, pa.int64()))
+    table = pack.table.select(names).append_column("row", pa.array(rows, pa.int64()))
     for modality in check_pack(model, pack):
         have = pack.has(modality)[rows]
         x = features(model, pack, modality, rows[have], for_heads=shared)

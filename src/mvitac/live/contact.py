@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from PIL import Image
+from tyro.conf import Fixed
 
 from mvitac.data.images import fit
 
@@ -18,9 +19,9 @@ class LiveConfig:
     """Number of first frames, without contact, from which a sensor's background and noise are learned."""
     contact: float = 6.0
     """Contact begins at a change of this many times the noise without contact, and ends at half of that."""
-    least_change: float = 1.0
+    least_change: Fixed[float] = 1.0
     """Mean change in grey levels below which nothing counts as contact, however low the noise."""
-    follow: float = 0.01
+    follow: Fixed[float] = 0.01
     """Share of the change by which the background is updated per frame while nothing is touched."""
 
     def __post_init__(self) -> None:

@@ -10,6 +10,7 @@ from typing import ClassVar
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
+from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
@@ -28,9 +29,9 @@ class BYOLConfig(MethodConfig):
     """Momentum m of the target tower at the start (BYOL: .996)."""
     momentum_end: float | None = 1.0
     """Value to which m rises along a half cosine (BYOL: 1)."""
-    out: int = 256
+    out: Fixed[int] = 256
     """Width of the embeddings (BYOL: 256)."""
-    hidden: int = 1024
+    hidden: Fixed[int] = 1024
     """Hidden width of projector and predictor. Twice the trunk's width, as BYOL's 4096 is twice that of ResNet-50."""
 
     def __post_init__(self) -> None:

@@ -23,6 +23,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
+from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
@@ -50,7 +51,7 @@ class CMCConfig(MethodConfig):
     """Share of the old value that a bank row keeps in an update (TAG: .5)."""
     softmax: bool = False
     """Use InfoNCE over the positive and the K negatives instead of NCE (an option of the reference code)."""
-    out: int = 128
+    out: Fixed[int] = 128
     """Width of the embeddings (TAG: 128)."""
 
     def __post_init__(self) -> None:

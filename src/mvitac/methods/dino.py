@@ -20,6 +20,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
+from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
@@ -46,9 +47,9 @@ class DINOConfig(MethodConfig):
     """Momentum m of the teacher at the start (DINO: .996)."""
     momentum_end: float | None = 1.0
     """Value to which m rises along a half cosine (DINO: 1)."""
-    out: int = 4096
+    out: Fixed[int] = 4096
     """Number of prototypes K. DINO's 65,536 are 5 % of ImageNet; 4,096 are 5 % of Touch and Go."""
-    hidden: int = 2048
+    hidden: Fixed[int] = 2048
     """Hidden width of the 3-layer head (DINO: 2048 for every trunk)."""
     prototype_norm: float = 0.577
     """Norm of the prototypes at the start (DINO: .577). They are normalised before use, so a larger norm means smaller

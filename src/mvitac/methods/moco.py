@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from torch import Tensor, nn
+from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
@@ -33,11 +34,11 @@ class QueueConfig(MethodConfig, ABC):
     """Momentum m of the key towers (MoCo: .999)."""
     momentum_end: float | None = None
     """If given, m rises to this value along a half cosine."""
-    out: int = 128
+    out: Fixed[int] = 128
     """Width of the embeddings (MoCo: 128)."""
-    hidden: int = 512
+    hidden: Fixed[int] = 512
     """Hidden width of the 2-layer heads (MoCo v2: the trunk's width)."""
-    head_norm: bool = False
+    head_norm: Fixed[bool] = False
     """BatchNorm after the first layer of the heads (MoCo v2: none)."""
 
     def __post_init__(self) -> None:

@@ -23,6 +23,7 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 import torch
 from torch import Tensor, nn
+from tyro.conf import Fixed
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
@@ -70,13 +71,13 @@ class MViTacConfig(MethodConfig):
     (paper). all: with both views of the other modality, at no extra forward pass; needs end-to-end keys."""
     losses: tuple[Literal["vv", "tt", "vt", "tv"], ...] = ("vv", "tt", "vt", "tv")
     """Losses of eq. 14 to minimise. The paper minimises all four."""
-    out: int = 128
+    out: Fixed[int] = 128
     """Width of the embeddings z (paper: 128)."""
-    hidden: int = 512
+    hidden: Fixed[int] = 512
     """Hidden width of the 2-layer heads. Not given in the paper; 2048 in the authors' code; 512 is the trunk's width."""
-    dropout: float = 0.0
+    dropout: Fixed[float] = 0.0
     """Dropout in the heads. None in the paper; .5 in the authors' code."""
-    head_norm: bool = False
+    head_norm: Fixed[bool] = False
     """BatchNorm after the first layer of the heads, as in MoCo v3 and SimCLR v2. None in the paper."""
 
     def __post_init__(self) -> None:

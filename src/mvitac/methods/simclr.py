@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
+from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
@@ -26,11 +27,11 @@ class SimCLRConfig(MethodConfig):
 
     temperature: float = 0.1
     """Temperature tau (SimCLR, table 5: .1 is best with normalised embeddings)."""
-    out: int = 128
+    out: Fixed[int] = 128
     """Width of the embeddings (SimCLR: 128)."""
-    hidden: int = 512
+    hidden: Fixed[int] = 512
     """Hidden width of the 2-layer head (SimCLR: the trunk's width)."""
-    head_norm: bool = True
+    head_norm: Fixed[bool] = True
     """BatchNorm after the first layer of the head (as in the authors' code)."""
 
     def __post_init__(self) -> None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from torch import Tensor, nn
+from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
@@ -29,7 +30,7 @@ class SSVTPConfig(MethodConfig):
 
     temperature: float = 0.07
     """Temperature tau. Not known for SSVTP; this is MViTac's best."""
-    out: int = 128
+    out: Fixed[int] = 128
     """Width of the embeddings (128 in MViTac's comparison, 8 in SSVTP)."""
 
     def __post_init__(self) -> None:

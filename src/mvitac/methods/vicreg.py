@@ -17,6 +17,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
+from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
@@ -36,7 +37,7 @@ class VICRegConfig(MethodConfig):
     """Weight of v (VICReg: 25)."""
     covariance: float = 1.0
     """Weight of c (VICReg: 1)."""
-    hidden: int = 2048
+    hidden: Fixed[int] = 2048
     """Width of the three expander layers. Four times the trunk's width, as VICReg's 8192 is four times that of ResNet-50."""
 
     def __post_init__(self) -> None:

@@ -14,6 +14,7 @@ from timm.models import PretrainedCfg, register_model
 from timm.models.resnet import BasicBlock, ResNet
 from timm.models.vision_transformer import VisionTransformer
 from torch import Tensor, nn
+from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.nn import imagenet
@@ -77,7 +78,7 @@ class EncoderConfig:
     weights: str = IMAGENET
     """Initial weights: `imagenet` (from timm's cache, an installed package, or the network), `scratch` (random), or a file
     with the trunk's state dict (.safetensors, .pth)."""
-    stem: Literal["repeat", "random"] = "repeat"
+    stem: Fixed[Literal["repeat", "random"]] = "repeat"
     """Start of a pretrained trunk's first convolution for images that do not have three channels: timm repeats and rescales
     its filters, or random (the authors' code)."""
     temporal: Literal["stack", "mean", "attention"] = "stack"
@@ -85,7 +86,7 @@ class EncoderConfig:
     features are averaged. attention: their weighted mean, with weights learned from the features and the frame's age."""
     locked: bool = False
     """Keep the trunk as it starts; its heads and the other trunk are trained (LiT, arXiv:2111.07991)."""
-    keep_norms: bool = False
+    keep_norms: Fixed[bool] = False
     """BatchNorm keeps the statistics that the trunk starts with, also for the images of training."""
     lr_scale: float = 1.0
     """Learning rate of the trunk relative to that of its heads, e.g. .1 to change pretrained weights slowly."""

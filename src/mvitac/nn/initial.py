@@ -3,10 +3,10 @@
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-import tyro
 from torch import Tensor, nn
+from tyro.conf import Fixed, arg
 
 from mvitac.nn.encoders import PerFrame
 from mvitac.nn.weights import load_weights, misfit, read_safetensors, safetensors_digest
@@ -18,14 +18,14 @@ MODEL = "model.safetensors"  # the file with the weights in the folder of a run 
 class Init:
     """Start weights from another model. Heads and modalities that are not taken start as the other settings say."""
 
-    path: Path | None = None
-    """Folder of a finished run or of an artifact, or a .safetensors file with weights. `--init X` is short for
-    `--init.path X`. Adapted where the number of channels differs."""
-    modalities: tyro.conf.Suppress[tuple[Literal["vision", "touch"], ...]] = ()
+    path: Annotated[Path | None, arg(name="init")] = None
+    """Folder of a finished run or of an artifact, or a .safetensors file with weights. Adapted
+    where the number of channels differs."""
+    modalities: Fixed[tuple[Literal["vision", "touch"], ...]] = ()
     """Encoders to take. Default: all that fit, and at least one."""
-    heads: tyro.conf.Suppress[bool] = True
+    heads: Fixed[bool] = True
     """Also take the heads into the space shared by both modalities, where they fit."""
-    digest: tyro.conf.Suppress[str] = ""
+    digest: Fixed[str] = ""
     """sha256 of the weights. Training records it."""
 
     def __post_init__(self) -> None:

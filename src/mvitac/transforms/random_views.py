@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
+from tyro.conf import Fixed
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -34,11 +35,11 @@ class ViewAugment:
     """Probability of a horizontal flip (paper: .5)."""
     grayscale: float = 0.2
     """Probability of grayscale (paper: .2 for materials, none for grasping)."""
-    jitter: float = 0.0
+    jitter: Fixed[float] = 0.0
     """Strength of brightness, contrast and per-channel gain jitter; each factor is 1 +- jitter (paper: none)."""
     size: int | None = None
     """Side in pixels of the crops of this modality. Default: that of both."""
-    whole: int | None = None
+    whole: Fixed[int | None] = None
     """Side in pixels of whole images of this modality. Default: its own size, else that of both."""
 
     @property

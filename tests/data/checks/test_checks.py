@@ -285,7 +285,7 @@ def test_a_part_of_a_source_proves_no_class_unseen(tmp_path: Path) -> None:
 def test_paths_with_brackets_are_shown_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "set [left]" / "[/red]"  # would end rich's markup
     build(Presses(), path, size=SIDE, quiet=True)
-    for arguments in (["info"], ["check"], ["show", "--limit", "1", "--out", f"{path}.png"]):
+    for arguments in (["info"], ["check"], ["show", "--num", "1", "--out", f"{path}.png"]):
         assert main(["data", arguments[0], str(path), *arguments[1:]]) == 0
         assert "set[left]/[/red]" in "".join(capsys.readouterr().out.split())  # wherever the line was broken
 

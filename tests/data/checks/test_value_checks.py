@@ -155,7 +155,7 @@ def test_the_command_checks_windows_when_asked(
     monkeypatch.setenv("COLUMNS", "200")
     main(["data", "check", str(healthy.path)])
     assert "windows of" not in capsys.readouterr().out
-    assert main(["data", "check", str(healthy.path), "--num-frames", "50"]) == 2
+    assert main(["data", "check", "--data", "pack", "--path", str(healthy.path), "--num-frames", "50"]) == 2
     assert "longer than every touch" in capsys.readouterr().out
 
 
