@@ -216,7 +216,7 @@ def test_imagenet_is_a_control_where_its_weights_are(
 ) -> None:
     toys = find_suite(str(root / "toys.toml"))
     run_bench([RANDOM.format(5)], toys, tmp_path / "without", root, About())
-    assert "without the control imagenet: ImageNet weights for resnet18" in capsys.readouterr().err
+    assert "without the control imagenet: ImageNet weights of resnet18" in capsys.readouterr().err
     known = {toys.imagenet: RANDOM.format(9)}
     monkeypatch.setattr(score, "open_model", lambda text: open_model(known.get(text, text)))
     value = read_result(run_bench([RANDOM.format(5)], toys, tmp_path / "with", root, About()))
