@@ -12,7 +12,8 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from mvitac.bench.external.base import OpenEncoder, open_encoder, parse, randomised
+from mvitac.bench.external.base import parse
+from mvitac.bench.external.encoder import open_encoder, randomised
 from mvitac.bench.external.preprocessing import Preprocessing
 from mvitac.bench.external.tower import Tower
 from support.owners import OWNERS, tvl
@@ -23,11 +24,11 @@ def test_features_are_those_of_the_network_written_out(owner: Callable[..., Any]
     text, slow = owner(tmp_path)
     found = open_encoder(text)
     generator = torch.Generator().manual_seed(1)
-    x = torch.randn(2, *found.encoder.preprocessing.input_shape(), generator=generator)
+    x = torch.randn(2, *found.preprocessing.input_shape(), generator=generator)
     with torch.no_grad():
         expected = slow(x)
         assert expected.std() > 0.01
-        torch.testing.assert_close(found.encoder.network(x), expected, rtol=2e-4, atol=2e-5)
+        torch.testing.assert_close(found.network(x), expected, rtol=2e-4, atol=2e-5)
 
 
 @pytest.mark.parametrize("owner", OWNERS)
@@ -149,9 +150,9 @@ def test_random_weights_for_the_control_leave_the_encoder_as_it_is(tmp_path: Pat
     found = open_encoder(tvl(tmp_path)[0])
     before = {name: value.clone() for name, value in found.loaded.network.state_dict().items()}
     untrained = found.untrained()
-    assert untrained is not None and isinstance(untrained, OpenEncoder) and untrained.loaded.trained_on == "nothing"
+    assert untrained is not None and untrained.loaded.trained_on == "nothing"
     assert all(torch.equal(value, before[name]) for name, value in found.loaded.network.state_dict().items())
     again = randomised(found.loaded.network, 0).state_dict()
-    for name, value in untrained.encoder.network.state_dict().items():
+    for name, value in untrained.network.state_dict().items():
         assert torch.equal(value, again[name]) and (value.ndim < 2 or not torch.equal(value, before[name]))
     assert open_encoder("external:timm/mvitac_tiny,weights=random,size=32").untrained() is None

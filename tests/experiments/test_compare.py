@@ -125,7 +125,7 @@ def test_rows_the_data_does_not_allow_are_told(tmp_path: Path) -> None:
     for label in ("lambda_inter 2.0", "losses tt", "losses vv + tt"):
         assert "the same run as 'MViTac'" in work.left_out[label]
     assert "the same run as 'no flips'" in work.left_out["no touch flips"]
-    assert "another modality" in work.left_out["losses vv"]
+    assert "lacks a modality" in work.left_out["losses vv"]
     with pytest.raises(ValueError, match="no row that this data allows"):
         lay_out(small(pack, rows=(Row(label="MViTac", method="cmc"),)), pack, tmp_path / "out", ProbeConfig())
 

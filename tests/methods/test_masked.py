@@ -238,7 +238,6 @@ def test_ijepa_is_smooth_l1_to_the_teachers_normalised_tokens(senses: str) -> No
 def test_the_teacher_follows_with_a_linear_momentum() -> None:
     config = IJEPAConfig()
     assert [config.ema_at(p) for p in (0.0, 0.25, 0.5, 1.0)] == pytest.approx([0.996, 0.997, 0.998, 1.0])
-    assert replace(config, ema_end=None).ema_at(0.7) == 0.996
     method = build("ijepa", config=replace(config, ema=0.5))
     assert isinstance(method, IJEPA)
     student, teacher = method.trunks["touch"].norm.weight, method.teachers["touch"].module.norm.weight  # type: ignore[union-attr]

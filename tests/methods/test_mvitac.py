@@ -4,38 +4,31 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 import torch.nn.functional as F
 
-from mvitac.data.spec import DataSpec
-from mvitac.methods.base import Views
-from mvitac.methods.mvitac import PARTS, MViTac, MViTacConfig
+from mvitac.methods.mvitac import PARTS, MViTacConfig
 from mvitac.nn.encoders import SCRATCH, Encoders
 from mvitac.run import Optim
 from mvitac.training.step import build_optimiser
 from support.slow_losses import slow_info_nce
+from support.small_methods import TINY, build, views
 from support.toy import Toy
 
-TINY = Encoders.both(trunk="mvitac_tiny", weights=SCRATCH)
 CONFIG = MViTacConfig(hidden=24, out=12)
 
 
-def build(config: MViTacConfig = CONFIG, spec: DataSpec | None = None) -> MViTac:
-    torch.manual_seed(0)
-    return config.build(spec or Toy().spec(), TINY)
-
-
-def views(num: int = 6, modalities: tuple[str, ...] = ("vision", "touch")) -> Views:
-    torch.manual_seed(5)
-    images = {m: [torch.randn(num, 3, 32, 32) for _ in range(2)] for m in modalities}
-    return Views(images=images, labels={}, rows=torch.arange(num))
+def built(**changes: Any) -> Any:
+    return build("mvitac", config=replace(CONFIG, **changes))
 
 
 def test_equals_the_paper_written_out() -> None:
     """Eq. 4-14 with the paper's symbols, one embedding at a time, on copies of the same weights."""
-    method, batch = build(replace(CONFIG, lambda_inter=0.7)), views()
+    method = built(lambda_inter=0.7)
+    batch = views(method)
     with torch.no_grad():  # make keys differ from queries, or confusing them would go unseen
         for p in method.key.parameters():
             p.add_(0.05 * torch.randn_like(p))
@@ -59,18 +52,18 @@ def test_equals_the_paper_written_out() -> None:
 
 
 def test_each_view_passes_each_encoder_once() -> None:
-    method = build()
+    method = built()
     calls: list[str] = []
     for side in ("query", "key"):
         for modality, tower in getattr(method, side).items():
             trunk = tower.trunk if side == "query" else tower.module.trunk
             trunk.register_forward_hook(lambda *_, name=f"{side} {modality}": calls.append(name))
-    method(views())
+    method(views(method))
     assert sorted(calls) == ["key touch", "key vision", "query touch", "query vision"]
 
 
 def test_keys_start_as_copies() -> None:
-    method = build()
+    method = built()
     for modality, tower in method.query.items():
         key = method.key[modality].module.state_dict()
         assert key.keys() == tower.state_dict().keys()
@@ -79,11 +72,11 @@ def test_keys_start_as_copies() -> None:
 
 
 def test_no_key_parameter_is_optimised_or_gets_a_gradient() -> None:
-    method = build()
+    method = built()
     optimiser = build_optimiser(Optim(), method, Encoders())
     optimised = {id(p) for group in optimiser.param_groups for p in group["params"]}
     assert optimised == {id(p) for p in method.query.parameters()}
-    method(views())["loss"].backward()
+    method(views(method))["loss"].backward()
     assert all(p.grad is None for p in method.key.parameters())
     assert all(p.grad is not None for p in method.query.parameters())
     for tower in method.query.values():  # inside the blocks some start at zero: timm zeroes each block's last BatchNorm
@@ -93,7 +86,7 @@ def test_no_key_parameter_is_optimised_or_gets_a_gradient() -> None:
 
 def test_every_key_parameter_and_buffer_follows() -> None:
     """Eq. 1-3: theta_k <- m theta_k + (1 - m) theta for trunk, both heads and BatchNorm's statistics."""
-    method = build(replace(CONFIG, momentum=0.9, head_norm=True))
+    method = built(momentum=0.9, head_norm=True)
     with torch.no_grad():
         for tensor in [*method.query.parameters(), *method.query.buffers()]:
             tensor.add_(1)
@@ -118,9 +111,9 @@ def test_heads_are_as_printed() -> None:
 
 def test_end_to_end_keys_are_the_queries_and_learn() -> None:
     """Without momentum towers: the mean loss of keys that equal the queries, in both ways; its gradient is another one."""
-    learned, copied = build(replace(CONFIG, keys="end-to-end")), build()
+    learned, copied = built(keys="end-to-end"), built()
     assert not list(learned.key.parameters())
-    batch = views()
+    batch = views(learned)
     turned = replace(batch, images={m: both[::-1] for m, both in batch.images.items()})
     mine, there, back = learned(batch), copied(batch), copied(turned)
     theirs = {name: (there[name] + back[name]) / 2 for name in there}
@@ -134,8 +127,8 @@ def test_end_to_end_keys_are_the_queries_and_learn() -> None:
 
 def test_all_pairs_are_the_mean_over_four_pairs_of_views() -> None:
     """Inter-modal losses: both queries against both keys; intra-modal ones never pair a view with itself."""
-    method = build(replace(CONFIG, keys="end-to-end", pairs="all"))
-    batch = views()
+    method = built(keys="end-to-end", pairs="all")
+    batch = views(method)
     z = method.queries(batch) | method.keys(batch)
     losses, tau = method.contrast(z), CONFIG.temperature
     for part, (mine, other) in PARTS.items():
@@ -148,24 +141,20 @@ def test_all_pairs_are_the_mean_over_four_pairs_of_views() -> None:
     assert not torch.allclose(method.contrast(z)["vt"], losses["vt"])
 
 
-def test_all_pairs_need_each_view_as_query_and_key() -> None:
-    with pytest.raises(ValueError, match="give keys 'end-to-end', or pairs 'crossed'"):
-        replace(CONFIG, pairs="all")
-
-
 @pytest.mark.parametrize("keys", ["momentum", "end-to-end"])
 def test_touch_alone_keeps_its_intra_loss(keys: str) -> None:
-    out = build(replace(CONFIG, keys=keys), Toy(vision_channels=0).spec())(views(modalities=("touch",)))  # type: ignore[arg-type]
+    method: Any = build("mvitac", Toy(vision_channels=0).spec(), replace(CONFIG, keys=keys))  # type: ignore[arg-type]
+    out = method(views(method, vision=0))
     assert set(out) == {"loss", "tt"} and torch.equal(out["loss"], out["tt"])
 
 
 @pytest.mark.parametrize("keys", ["momentum", "end-to-end"])
 def test_the_loss_between_sensors_written_out(keys: str) -> None:
     """One more term beside eq. 14: touch view 0 and view 2, the same press through another sensor, by the intra heads."""
-    plain, method = (build(replace(CONFIG, keys=keys, lambda_sensor=weight)) for weight in (0.0, 0.3))
-    batch = views()
+    plain, method = (built(keys=keys, lambda_sensor=weight) for weight in (0.0, 0.3))
+    batch = views(method)
     torch.manual_seed(8)
-    batch.images["touch"].append(torch.randn(6, 3, 32, 32))
+    batch.images["touch"].append(torch.randn(8, 3, 32, 32))
     query = method.query["touch"]
     key = query if keys == "end-to-end" else method.key["touch"].module
     with torch.no_grad():
@@ -175,15 +164,31 @@ def test_the_loss_between_sensors_written_out(keys: str) -> None:
             query.intra(query.trunk(batch.images["touch"][0])), key.intra(key.trunk(batch.images["touch"][2])), 0.07
         )
         plain.load_state_dict(method.state_dict())
-        out, without = method(batch), plain(views())
+        out, without = method(batch), plain(views(plain))
     assert float(out["sensor"]) == pytest.approx(expected, rel=1e-4)
     assert float(out["loss"]) == pytest.approx(float(without["loss"]) + 0.3 * expected, rel=1e-4)
     assert "sensor" not in without
 
 
-def test_the_loss_between_sensors_needs_touch() -> None:
-    vision_only = replace(Toy().spec(), touch_channels=0)
-    config = replace(CONFIG, lambda_sensor=1.0)
+def test_settings_that_cannot_work_are_refused() -> None:
+    vision_only, sensors = replace(Toy().spec(), touch_channels=0), replace(CONFIG, lambda_sensor=1.0)
     with pytest.raises(ValueError, match="has no touch"):
-        config.build(vision_only, TINY)
-    assert config.without_idle(vision_only).lambda_sensor == 0 and config.without_idle(Toy().spec()) == config
+        sensors.build(vision_only, TINY)
+    assert sensors.without_idle(vision_only).lambda_sensor == 0 and sensors.without_idle(Toy().spec()) == sensors
+    with pytest.raises(ValueError, match="give keys 'end-to-end', or pairs 'crossed'"):
+        replace(CONFIG, pairs="all")
+    with pytest.raises(ValueError, match="losses"):
+        replace(CONFIG, losses=())
+    with pytest.raises(ValueError, match="give some of vv"):
+        replace(CONFIG, losses=("tt", "vt")).build(vision_only, TINY)
+
+
+def test_left_out_losses_are_told_but_not_minimised() -> None:
+    full = built()
+    batch = views(full)
+    parts = full(batch)
+    for losses in (("tt",), ("vv", "tv"), ("vt", "tv")):
+        part = built(losses=losses, lambda_inter=0.5)(batch)
+        expected = sum(parts[name] * (0.5 if name in ("vt", "tv") else 1) for name in losses)
+        torch.testing.assert_close(part["loss"], expected)
+        assert set(part) == {"loss", "vv", "tt", "vt", "tv"}

@@ -189,7 +189,9 @@ def test_inter_modal_losses_are_of_whole_pairs() -> None:
 @pytest.mark.parametrize("name", [*PAIRED, "supervised"])
 def test_a_method_that_needs_whole_pairs_names_the_rows(parts: dict[str, str], name: str, tmp_path: Path) -> None:
     run = with_method(mix_run(parts["a"], parts["gel"]), name)
-    message = rf"method '{name}' needs vision and touch of every row, but \d+ rows of part gel have no vision: leave"
+    message = (
+        rf"method '{name}' needs vision and touch of every row, but \d+ rows of part gel have no vision: choose of"
+    )
     with pytest.raises(ValueError, match=message):
         train(run, tmp_path / "run", quiet=True)
     assert not (tmp_path / "run").exists()

@@ -162,8 +162,10 @@ def frozen_trunks(runs: Sequence[Run], stored: int) -> list[tuple[str, Run]]:
     """The pre-trained trunks to probe as they are, by name: ImageNet's, and files that ``runs`` started from.
 
     ImageNet is left out where no weights are installed or cached (``imagenet.source``). It sees images as large as the
-    runs do, or as they are ``stored`` [px], up to ``IMAGENET_SIDE``.
+    runs do, or as they are ``stored`` [px], up to ``IMAGENET_SIDE``. Other people's encoders alone have no such row.
     """
+    if not runs:
+        return []
     first = replace(runs[0], method=SimCLRConfig())  # its heads are not read; it takes any trunk and modality
     found = {run.encoder: "start" for run in runs if {_file(run.encoder.vision), _file(run.encoder.touch)} != {""}}
     named = [(name, replace(first, encoder=encoder)) for encoder, name in found.items()]

@@ -3,7 +3,6 @@
 Shapes: B images in a batch, V views of each image, C channels, H x W pixels, D features.
 """
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
 from dataclasses import dataclass, field
@@ -153,28 +152,8 @@ class MethodConfig(Registered, ABC):
     """Whether rows of a batch may lack a modality: they then have no part in the losses that need it."""
     needs_vit: ClassVar[bool] = False
     """Whether the trunk must be a plain ViT."""
-
-    def check_fields(
-        self,
-        *,
-        positive: tuple[str, ...] = (),
-        weight: tuple[str, ...] = (),
-        share: tuple[str, ...] = (),
-        width: tuple[str, ...] = (),
-    ) -> None:
-        """Check that ``positive`` fields are > 0, ``weight`` >= 0, ``share`` in [0, 1] or None, ``width`` 1 to 65536."""
-        for name in positive:
-            if not (getattr(self, name) > 0 and math.isfinite(getattr(self, name))):
-                raise ValueError(f"{name} {getattr(self, name)}: give a positive number")
-        for name in weight:
-            if not (getattr(self, name) >= 0 and math.isfinite(getattr(self, name))):
-                raise ValueError(f"{name} {getattr(self, name)}: give a finite number >= 0")
-        for name in share:
-            if getattr(self, name) is not None and not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} {getattr(self, name)}: give a number from 0 to 1")
-        for name in width:
-            if not 1 <= getattr(self, name) <= 65536:
-                raise ValueError(f"{name} {getattr(self, name)}: give 1 to 65536")
+    label_splits: ClassVar[tuple[str, ...]] = ("train",)
+    """Splits whose labels ``Views.labels`` has."""
 
     def on_tiny_trunk(self, spec: DataSpec, encoder: Encoders) -> Method:
         """The method on a trunk that is built in no time, to find out whether and how it works on the dataset."""
@@ -188,11 +167,9 @@ class MethodConfig(Registered, ABC):
     def check_modalities(self, spec: DataSpec) -> None:
         """Raise ValueError if the method ``needs_pairs`` and the dataset lacks a modality."""
         if self.needs_pairs and len(spec.modalities) < 2:
-            others = sorted(name for name, config in self.choices.items() if not config.needs_pairs)  # type: ignore
-            raise ValueError(
-                f"method {self.name!r} learns from pairs, but dataset {spec.name!r} has {', '.join(spec.modalities)} only:"
-                f" choose a --method that needs no pairs ({', '.join(others)})"
-            )
+            others = ", ".join(sorted(name for name, config in self.choices.items() if not config.needs_pairs))  # type: ignore
+            only = f"dataset {spec.name!r} has {', '.join(spec.modalities)} only"
+            raise ValueError(f"method {self.name!r} learns from pairs, but {only}: choose of {others}")
 
     @property
     def sensor_view(self) -> bool:
@@ -208,21 +185,11 @@ class MethodConfig(Registered, ABC):
             pairs = np.unique(np.stack([pack.presses[rows], pack.sensors[rows]]), axis=1)
         if not (np.bincount(pairs[0]) > 1).any():
             raise ValueError(
-                "lambda_sensor needs rows of one press (column press) and different sensors (column sensor) to train on:"
-                " simulate with --data.sensors-per-press 2"
+                "lambda_sensor needs rows of one press (column press) and different sensors (column sensor)"
             )
 
-    @property
-    def label_splits(self) -> tuple[str, ...]:
-        """Splits whose labels ``Views.labels`` has."""
-        return ("train",)
-
     def training_rows(self, pack: Pack) -> np.ndarray:
-        """Pack rows to train on, ascending: train and unlabelled, with all modalities of their dataset (part of a mix).
-
-        Raises:
-            ValueError: If a part of a mix lacks a modality, and the method needs it.
-        """
+        """Pack rows to train on, ascending: train and unlabelled, with all modalities of their dataset (part of a mix)."""
         rows = pack.rows("train", "unlabelled")
         rows = rows[pack.whole[rows]]
         if not self.takes_missing:
@@ -235,12 +202,10 @@ class MethodConfig(Registered, ABC):
             lacking = rows[~pack.has(modality)[rows]]
             if len(lacking):
                 parts = ", ".join(np.unique(pack.column("part")[lacking]))
-                others = sorted(name for name, config in self.choices.items() if config.takes_missing)  # type: ignore
-                raise ValueError(
-                    f"method {self.name!r} needs {' and '.join(modalities)} of every row, but {len(lacking)} rows of part"
-                    f" {parts} have no {modality}: leave the part out, or choose a --method with losses for each modality"
-                    f" ({', '.join(others)})"
-                )
+                others = ", ".join(sorted(name for name, kind in self.choices.items() if kind.takes_missing))  # type: ignore
+                no = f"{len(lacking)} rows of part {parts} have no {modality}"
+                needs = f"method {self.name!r} needs {' and '.join(modalities)} of every row"
+                raise ValueError(f"{needs}, but {no}: choose of {others}")
 
     def without_idle(self, spec: DataSpec) -> Self:
         """This config with every setting that has no effect on the dataset at a fixed value.

@@ -16,6 +16,7 @@ from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
 from mvitac.nn.encoders import Encoders, Head, Projected, build_trunk, num_features, trunks
 from mvitac.nn.momentum import Momentum, momentum_at
+from mvitac.registry import check_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,16 +27,15 @@ class BYOLConfig(MethodConfig):
     takes_missing: ClassVar[bool] = True
 
     momentum: float = 0.996
-    """Momentum m of the target tower at the start (BYOL: .996)."""
-    momentum_end: float | None = 1.0
-    """Value to which m rises along a half cosine (BYOL: 1)."""
+    """Momentum m of the target tower at the start (BYOL: .996). It rises to 1 along a half cosine."""
     out: Fixed[int] = 256
     """Width of the embeddings (BYOL: 256)."""
     hidden: Fixed[int] = 1024
     """Hidden width of projector and predictor. Twice the trunk's width, as BYOL's 4096 is twice that of ResNet-50."""
 
     def __post_init__(self) -> None:
-        self.check_fields(share=("momentum", "momentum_end"), width=("out", "hidden"))
+        check_range(self, 0, 1, "momentum")
+        check_range(self, 1, 65536, "out", "hidden")
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "BYOL":
         return BYOL(self, spec, encoder)
@@ -69,18 +69,14 @@ class BYOL(Contrastive):
         return {("k", m, i): target(batch.images[m][i]) for m, target in present(self.target, batch) for i in (0, 1)}
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
+        seen = (m for m in self.online if ("q", m, 0) in z)
         return with_sum(
-            {
-                m: regression(z["q", m, 0], z["k", m, 1]) + regression(z["q", m, 1], z["k", m, 0])
-                for m in self.online
-                if ("q", m, 0) in z
-            }
+            {m: regression(z["q", m, 0], z["k", m, 1]) + regression(z["q", m, 1], z["k", m, 0]) for m in seen}
         )
 
     def encoders(self) -> dict[str, nn.Module]:
         return trunks(self.online)
 
     def after_step(self, progress: float) -> None:
-        m = momentum_at(progress, self.config.momentum, self.config.momentum_end)
         for target in self.target.values():
-            target.follow(m)  # type: ignore[operator]
+            target.follow(momentum_at(progress, self.config.momentum))  # type: ignore[operator]

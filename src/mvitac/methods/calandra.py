@@ -22,24 +22,14 @@ class CalandraConfig(LabelledConfig):
 
     name: ClassVar[str] = "calandra"
 
-    widths: tuple[int, int] = (512, 256)
-    """Widths of the two hidden layers after the trunks (512, 256)."""
-
-    def __post_init__(self) -> None:
-        for width in self.widths:
-            if not 1 <= width <= 65536:
-                raise ValueError(f"widths {self.widths}: give two numbers, each 1 to 65536")
-
     def build(self, spec: DataSpec, encoder: Encoders) -> Supervised:
         streams: dict[str, nn.Module] = {
             m: Streams(encoder[m], spec.channels(m) // 3) for m in self.modalities_of(spec)
         }
         width = sum(num_features(stream) for stream in streams.values())
-        first, second = self.widths
 
         def layers(num: int) -> nn.Module:
-            hidden = (nn.Linear(width, first), nn.ReLU(), nn.Linear(first, second), nn.ReLU())
-            return nn.Sequential(*hidden, nn.Linear(second, num))
+            return nn.Sequential(nn.Linear(width, 512), nn.ReLU(), nn.Linear(512, 256), nn.ReLU(), nn.Linear(256, num))
 
         return Supervised(streams, self.heads(spec, layers))
 

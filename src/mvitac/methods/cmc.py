@@ -29,8 +29,10 @@ from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
 from mvitac.nn.encoders import Encoders, build_towers, heads, trunks
 from mvitac.nn.memory_bank import Bank
+from mvitac.registry import check_range
 
 EPS = 1e-7  # added to both denominators, as in the reference code
+NEGATIVES_PER_ROW = 0.18  # at most: TAG's 16,384 of 91,982 rows
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,10 +43,7 @@ class CMCConfig(MethodConfig):
     needs_pairs: ClassVar[bool] = True
 
     num_negatives: int = 16384
-    """Number of negatives K, drawn from the bank for each query (TAG: 16384)."""
-    negatives_per_row: float = 0.18
-    """At most this many negatives per training row (TAG: 16,384 of 91,982 rows). 0 = no limit, as in runs before this
-    field."""
+    """Number of negatives K, drawn from the bank for each query (TAG: 16384); at most .18 per training row."""
     temperature: float = 0.07
     """Temperature tau (TAG: .07)."""
     bank_momentum: float = 0.5
@@ -55,16 +54,14 @@ class CMCConfig(MethodConfig):
     """Width of the embeddings (TAG: 128)."""
 
     def __post_init__(self) -> None:
-        self.check_fields(positive=("temperature",), share=("bank_momentum",), width=("out",))
-        if not 1 <= self.num_negatives <= 1 << 20:
-            raise ValueError(f"num_negatives {self.num_negatives}: give 1 to {1 << 20}")
-        if not 0 <= self.negatives_per_row <= 1 << 20:
-            raise ValueError(f"negatives_per_row {self.negatives_per_row}: give 0 to {1 << 20}")
+        check_range(self, 1e-6, 1e6, "temperature")
+        check_range(self, 0, 1, "bank_momentum")
+        check_range(self, 1, 65536, "out")
+        check_range(self, 1, 1 << 20, "num_negatives")
 
     def negatives(self, num_rows: int) -> int:
         """Number of negatives when training on ``num_rows`` rows."""
-        limit = max(1, int(self.negatives_per_row * num_rows)) if self.negatives_per_row else self.num_negatives
-        return min(self.num_negatives, limit)
+        return min(self.num_negatives, max(1, int(NEGATIVES_PER_ROW * num_rows)))
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "CMC":
         self.check_modalities(spec)

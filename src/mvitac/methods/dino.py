@@ -26,8 +26,12 @@ from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
 from mvitac.nn.encoders import Encoders, build_towers, trunks
 from mvitac.nn.momentum import Momentum, momentum_at
+from mvitac.registry import check_range
 
 BOTTLENECK = 256
+NORM = 0.577
+"""Norm of the prototypes at the start (DINO's). They are normalised before use, so a larger one means smaller steps of their
+direction: at 16 they hardly move."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,23 +48,16 @@ class DINOConfig(MethodConfig):
     centre_momentum: float = 0.9
     """Share of the old value that the centre keeps in a step (DINO: .9)."""
     momentum: float = 0.996
-    """Momentum m of the teacher at the start (DINO: .996)."""
-    momentum_end: float | None = 1.0
-    """Value to which m rises along a half cosine (DINO: 1)."""
+    """Momentum m of the teacher at the start (DINO: .996). It rises to 1 along a half cosine."""
     out: Fixed[int] = 4096
     """Number of prototypes K. DINO's 65,536 are 5 % of ImageNet; 4,096 are 5 % of Touch and Go."""
     hidden: Fixed[int] = 2048
     """Hidden width of the 3-layer head (DINO: 2048 for every trunk)."""
-    prototype_norm: float = 0.577
-    """Norm of the prototypes at the start (DINO: .577). They are normalised before use, so a larger norm means smaller
-    steps of their direction: at 16, as in runs before this field, they hardly move."""
 
     def __post_init__(self) -> None:
-        self.check_fields(
-            positive=("student_temperature", "teacher_temperature", "prototype_norm"),
-            share=("centre_momentum", "momentum", "momentum_end"),
-            width=("out", "hidden"),
-        )
+        check_range(self, 1e-6, 1e6, "student_temperature", "teacher_temperature")
+        check_range(self, 0, 1, "centre_momentum", "momentum")
+        check_range(self, 1, 65536, "out", "hidden")
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "DINO":
         return DINO(self, spec, encoder)
@@ -69,12 +66,12 @@ class DINOConfig(MethodConfig):
 class Prototypes(nn.Module):
     """An MLP with a bottleneck: features [B, D] to cosines [B, K] with K learned directions."""
 
-    def __init__(self, features: int, hidden: int, num: int, norm: float) -> None:
+    def __init__(self, features: int, hidden: int, num: int) -> None:
         super().__init__()
         self.mlp = nn.Sequential(
             nn.Linear(features, hidden), nn.GELU(), nn.Linear(hidden, hidden), nn.GELU(), nn.Linear(hidden, BOTTLENECK)
         )
-        self.directions = nn.Parameter(torch.randn(num, BOTTLENECK) * (norm / BOTTLENECK**0.5))
+        self.directions = nn.Parameter(torch.randn(num, BOTTLENECK) * (NORM / BOTTLENECK**0.5))
 
     def forward(self, features: Float[Tensor, "B D"]) -> Float[Tensor, "B K"]:
         return F.linear(F.normalize(self.mlp(features), dim=1), F.normalize(self.directions, dim=1))
@@ -95,8 +92,7 @@ class DINO(Contrastive):
     def __init__(self, config: DINOConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
-        sizes = config.hidden, config.out, config.prototype_norm
-        self.student = build_towers(encoder, spec, lambda width: Prototypes(width, *sizes))
+        self.student = build_towers(encoder, spec, lambda width: Prototypes(width, config.hidden, config.out))
         self.teacher = nn.ModuleDict({m: Momentum(tower) for m, tower in self.student.items()})
         self.register_buffer("centre", torch.zeros(len(self.student), config.out))
         self.pending: Tensor | None = None
@@ -128,6 +124,5 @@ class DINO(Contrastive):
     def after_step(self, progress: float) -> None:
         assert self.pending is not None, "call forward first"
         self.centre.lerp_(self.pending, 1 - self.config.centre_momentum)
-        m = momentum_at(progress, self.config.momentum, self.config.momentum_end)
         for teacher in self.teacher.values():
-            teacher.follow(m)  # type: ignore[operator]
+            teacher.follow(momentum_at(progress, self.config.momentum))  # type: ignore[operator]

@@ -14,7 +14,7 @@ Block sizes are drawn once per batch (per chunk, with ``--chunk``), places once 
 here, because masks are made on the device without waiting for it:
 - Contexts have a fixed length, the (1 - .15)^4 of the image that 4 blocks leave if they do not overlap much: longer ones are
   cut at random, missing patches of shorter ones are hidden from attention. Theirs are cut to the shortest of the batch.
-- Of 8 draws, the first with ``min_context`` patches of context, else that with the most. Theirs draw until it fits.
+- Of 8 draws, the first with 10 patches of context, else that with the most. Theirs draw until it fits.
 - A block may touch the last row and column, and cover the whole image. Theirs are drawn one short of both.
 Sources: the paper (section 3, appendix A.1); facts of https://github.com/facebookresearch/ijepa (multiblock.py, train.py,
 in1k_vith14_ep300.yaml). Not implemented: the rising weight decay (here the recipe's, for all methods).
@@ -37,8 +37,12 @@ from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, wi
 from mvitac.nn import vit
 from mvitac.nn.encoders import EncoderConfig, Encoders
 from mvitac.nn.momentum import Momentum
+from mvitac.registry import check_range
 
 TRIES = 8
+ASPECT, CONTEXT, MIN_CONTEXT = (0.75, 1.5), (0.85, 1.0), 10
+"""I-JEPA's: height over width of a target block; area of the context block, before the targets are taken out, as a range of
+shares of the image; patches of context that an image should keep."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,34 +56,16 @@ class IJEPAConfig(MethodConfig):
     """Number of target blocks M (I-JEPA: 4)."""
     target_scale: tuple[float, float] = (0.15, 0.2)
     """Area of a target block, as a range of shares of the image (I-JEPA: .15 to .2)."""
-    target_aspect: tuple[float, float] = (0.75, 1.5)
-    """Height over width of a target block (I-JEPA: .75 to 1.5)."""
-    context_scale: tuple[float, float] = (0.85, 1.0)
-    """Area of the context block, before the targets are taken out (I-JEPA: .85 to 1)."""
-    min_context: int = 10
-    """Patches of context that an image should keep (I-JEPA: 10)."""
     ema: float = 0.996
-    """Momentum of the teacher at the start (I-JEPA: .996)."""
-    ema_end: float | None = 1.0
-    """Value to which it rises linearly (I-JEPA: 1)."""
+    """Momentum of the teacher at the start (I-JEPA: .996). It rises to 1 linearly."""
     senses: vit.Senses = "own"
     """What a predictor sees. own: the context of its modality. both: also that of the other modality."""
-    predictor_width: int | None = None
-    """Width of the predictor, a multiple of 4. Default: half of the trunk's, at most 384, in whole heads of 32 features
-    (I-JEPA: 384)."""
-    predictor_depth: int | None = None
-    """Blocks of the predictor. Default: half of the trunk's, at most 12 (I-JEPA: 6 for ViT-B, 12 for ViT-H)."""
 
     def __post_init__(self) -> None:
-        self.check_fields(share=("ema", "ema_end"))
-        for name, most in (("num_targets", 64), ("min_context", 65536)):
-            if not 1 <= getattr(self, name) <= most:
-                raise ValueError(f"{name} {getattr(self, name)}: give 1 to {most}")
-        for name, top in (("target_scale", 1.0), ("context_scale", 1.0), ("target_aspect", 100.0)):
-            low, high = getattr(self, name)
-            if not 0 < low <= high <= top:
-                raise ValueError(f"{name} {(low, high)}: give two rising numbers above 0, at most {top:g}")
-        vit.check_predictor("predictor", self.predictor_width, self.predictor_depth)
+        check_range(self, 0, 1, "ema")
+        check_range(self, 1, 64, "num_targets")
+        if not 0 < self.target_scale[0] <= self.target_scale[1] <= 1:
+            raise ValueError(f"target_scale {self.target_scale}: give two rising numbers above 0, at most 1")
 
     def check_encoder(self, encoder: EncoderConfig, size: int) -> None:
         vit.check_vit(encoder, self.name, size)
@@ -89,8 +75,7 @@ class IJEPAConfig(MethodConfig):
 
     def ema_at(self, progress: float) -> float:
         """Momentum of the teacher at ``progress`` (0 to 1) of the run."""
-        end = self.ema if self.ema_end is None else self.ema_end
-        return self.ema + (end - self.ema) * progress
+        return self.ema + (1 - self.ema) * progress
 
 
 @dataclass(frozen=True)
@@ -122,7 +107,7 @@ def multi_block(config: IJEPAConfig, seed: Tensor, rows: Tensor, stream: int, gr
 
     # Sizes, the same for all images: [M + 1, 2], targets before context.
     draws = vit.row_uniform(seed, torch.full_like(rows[:1], -1), 3, 2 * stream)[0]
-    ranges = (config.target_scale, config.target_aspect, config.context_scale)
+    ranges = (config.target_scale, ASPECT, CONTEXT)
     scale, aspect, context_scale = (low + (high - low) * u for (low, high), u in zip(ranges, draws, strict=True))
     side = block_sides(scale, aspect, grid)
     sides = torch.stack([side] * num_targets + [block_sides(context_scale, torch.ones_like(aspect), grid)])
@@ -138,7 +123,7 @@ def multi_block(config: IJEPAConfig, seed: Tensor, rows: Tensor, stream: int, gr
     # The first try with enough context, else that with the most.
     contexts = inside[:, :, -1] & ~inside[:, :, :-1].any(2)
     counts = contexts.sum(2)
-    rank = torch.where(counts >= config.min_context, num + TRIES - torch.arange(TRIES, device=device), counts)
+    rank = torch.where(counts >= MIN_CONTEXT, num + TRIES - torch.arange(TRIES, device=device), counts)
     best = rank.argmax(1, keepdim=True)[:, :, None, None]
     context = contexts.take_along_dim(best[..., 0], 1)[:, 0]
     corner = corner[:, :, :-1].take_along_dim(best, 1)[:, 0].long()
@@ -147,7 +132,7 @@ def multi_block(config: IJEPAConfig, seed: Tensor, rows: Tensor, stream: int, gr
     room = max(1, round(num * (1 - config.target_scale[0]) ** num_targets))
     order = (context + vit.row_uniform(seed, rows, num, 2 * stream + 1)).argsort(dim=1, descending=True)[:, :room]
     in_context = torch.arange(room, device=device) < context.sum(1, keepdim=True).clamp(min=1)
-    area, (low, high) = math.floor(config.target_scale[1] * num), config.target_aspect
+    area, (low, high) = math.floor(config.target_scale[1] * num), ASPECT
     most_high, most_wide = (min(grid[i], max(1, round(math.sqrt(area * (high, 1 / low)[i])))) for i in (0, 1))
     slot = torch.arange(most_high * most_wide, device=device)
     offset = torch.stack([slot // most_wide, slot % most_wide], dim=1)
@@ -157,19 +142,18 @@ def multi_block(config: IJEPAConfig, seed: Tensor, rows: Tensor, stream: int, gr
 
 
 class IJEPA(Contrastive):
-    """A ViT, its momentum copy (the teacher) and a predictor per modality."""
+    """A ViT, its momentum copy (the teacher) and a predictor per modality: half as wide and deep, at most 384 and 12."""
 
     def __init__(self, config: IJEPAConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
         self.trunks = vit.build_vits(encoder, spec, config.name, config.senses)
         self.teachers = nn.ModuleDict({m: Momentum(vit.vit_of(trunk)) for m, trunk in self.trunks.items()})
-        shape = (config.predictor_width, config.predictor_depth)
         self.predictors = nn.ModuleDict()
         for modality, trunk in self.trunks.items():
             width = vit.vit_of(trunk).embed_dim
             other = vit.other_trunk(self.trunks, modality, config.senses)
-            self.predictors[modality] = vit.Predictor(trunk, width, other, shape, 1 / 2, (384, 12))
+            self.predictors[modality] = vit.Predictor(trunk, width, other, 1 / 2, (384, 12))
 
     def blocks(self, batch: Views, modality: str) -> Blocks:
         """The blocks of each image that the ViT of ``modality`` sees."""

@@ -30,6 +30,7 @@ from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
 from mvitac.nn import vit
 from mvitac.nn.encoders import EncoderConfig, Encoders
+from mvitac.registry import check_range
 
 EPS = 1e-6  # added to the variance of a patch, as in the authors' code
 
@@ -47,16 +48,9 @@ class MAEConfig(MethodConfig):
     """Predict each patch minus its mean and over its standard deviation (MAE, T3). Sparsh and AnyTouch: off."""
     senses: vit.Senses = "own"
     """What a decoder sees. own: the visible patches of its modality. both: also those of the other modality."""
-    decoder_width: int | None = None
-    """Width of the decoder, a multiple of 4. Default: two thirds of the trunk's, at most 512, in whole heads of 32
-    features (MAE: 512 for the 768 of ViT-B)."""
-    decoder_depth: int | None = None
-    """Blocks of the decoder. Default: two thirds of the trunk's, at most 8 (MAE: 8 for the 12 of ViT-B)."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.mask_ratio < 1:
-            raise ValueError(f"mask_ratio {self.mask_ratio}: give a share between 0 and 1")
-        vit.check_predictor("decoder", self.decoder_width, self.decoder_depth)
+        check_range(self, 0.01, 0.99, "mask_ratio")
 
     def check_encoder(self, encoder: EncoderConfig, size: int) -> None:
         vit.check_vit(encoder, self.name, size)
@@ -82,18 +76,17 @@ def pixel_targets(values: Float[Tensor, "B N P"], pixel_norm: bool) -> Float[Ten
 
 
 class MAE(Contrastive):
-    """A ViT and a decoder per modality."""
+    """A ViT and a decoder per modality. Width and depth of a decoder are two thirds of the trunk's, at most 512 and 8."""
 
     def __init__(self, config: MAEConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
         self.trunks = vit.build_vits(encoder, spec, config.name, config.senses)
-        shape = (config.decoder_width, config.decoder_depth)
         self.decoders = nn.ModuleDict()
         for modality, trunk in self.trunks.items():
             pixels = vit.patches(trunk, torch.zeros(1, spec.channels(modality), 1, 1)).shape[2]
             other = vit.other_trunk(self.trunks, modality, config.senses)
-            self.decoders[modality] = vit.Predictor(trunk, pixels, other, shape, 2 / 3, (512, 8))
+            self.decoders[modality] = vit.Predictor(trunk, pixels, other, 2 / 3, (512, 8))
 
     def queries(self, batch: Views) -> Embeddings:
         """("loss", modality) -> [B], the loss of each row."""

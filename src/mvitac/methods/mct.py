@@ -25,6 +25,7 @@ from mvitac.methods.mvitac import PARTS, MViTac, MViTacConfig
 from mvitac.nn.encoders import Encoders
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Queue
+from mvitac.registry import check_range
 
 HEADS = [(modality, head) for modality in ("vision", "touch") for head in ("intra", "inter")]  # each has a queue
 
@@ -45,7 +46,8 @@ class MCTConfig(QueueConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_fields(positive=("temperature",), weight=("margin", "lambda_inter"))
+        check_range(self, 1e-6, 1e6, "temperature")
+        check_range(self, 0, 1e6, "margin", "lambda_inter")
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "MCT":
         self.check_modalities(spec)

@@ -18,7 +18,11 @@ from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, pr
 from mvitac.nn.encoders import Encoders, Head, build_towers, trunks
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Queue
-from mvitac.nn.momentum import Momentum, momentum_at
+from mvitac.nn.momentum import Momentum
+from mvitac.registry import check_range
+
+KEYS_PER_ROW = 0.125
+"""Most keys per training row. In a longer queue, a row often meets its own older key and those of its positives."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,14 +30,10 @@ class QueueConfig(MethodConfig, ABC):
     """Fields shared by the methods with a queue (moco, mct)."""
 
     queue: int = 4096
-    """Number of keys K in each queue. MoCo's 65,536 are 5 % of ImageNet; 4,096 are 5 % of Touch and Go."""
-    queue_per_row: float = 0.125
-    """At most this many keys per training row. In a longer queue, a row often meets its own older key and those of its
-    positives as negatives."""
+    """Number of keys K in each queue. MoCo's 65,536 are 5 % of ImageNet; 4,096 are 5 % of Touch and Go. At most one for
+    eight training rows."""
     momentum: float = 0.999
     """Momentum m of the key towers (MoCo: .999)."""
-    momentum_end: float | None = None
-    """If given, m rises to this value along a half cosine."""
     out: Fixed[int] = 128
     """Width of the embeddings (MoCo: 128)."""
     hidden: Fixed[int] = 512
@@ -42,15 +42,13 @@ class QueueConfig(MethodConfig, ABC):
     """BatchNorm after the first layer of the heads (MoCo v2: none)."""
 
     def __post_init__(self) -> None:
-        self.check_fields(share=("momentum", "momentum_end"), width=("out", "hidden"))
-        if not 1 <= self.queue <= 1 << 24:
-            raise ValueError(f"queue {self.queue}: give 1 to {1 << 24} keys")
-        if not 0 < self.queue_per_row <= 1:
-            raise ValueError(f"queue_per_row {self.queue_per_row}: give a share of the training rows, > 0 and <= 1")
+        check_range(self, 0, 1, "momentum")
+        check_range(self, 1, 65536, "out", "hidden")
+        check_range(self, 1, 1 << 24, "queue")
 
     def queue_size(self, num_rows: int) -> int:
         """Number of keys to keep when training on ``num_rows`` rows."""
-        return min(self.queue, max(1, int(self.queue_per_row * num_rows)))
+        return min(self.queue, max(1, int(KEYS_PER_ROW * num_rows)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +63,7 @@ class MoCoConfig(QueueConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_fields(positive=("temperature",))
+        check_range(self, 1e-6, 1e6, "temperature")
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "MoCo":
         return MoCo(self, spec, encoder)
@@ -79,9 +77,8 @@ class MoCo(Contrastive):
     def __init__(self, config: MoCoConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
-        self.query = build_towers(
-            encoder, spec, lambda width: Head(width, config.hidden, config.out, norm=config.head_norm)
-        )
+        sizes = config.hidden, config.out
+        self.query = build_towers(encoder, spec, lambda width: Head(width, *sizes, norm=config.head_norm))
         self.key = nn.ModuleDict({m: Momentum(tower) for m, tower in self.query.items()})
         self.queues = nn.ModuleDict()
         self.pending: dict[str, Tensor] = {}
@@ -107,8 +104,7 @@ class MoCo(Contrastive):
         return trunks(self.query)
 
     def after_step(self, progress: float) -> None:
-        m = momentum_at(progress, self.config.momentum, self.config.momentum_end)
         for modality, keys in self.pending.items():
             self.queues[modality].push(keys)  # type: ignore[operator]
         for tower in self.key.values():
-            tower.follow(m)  # type: ignore[operator]
+            tower.follow(self.config.momentum)  # type: ignore[operator]

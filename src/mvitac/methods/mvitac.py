@@ -40,6 +40,7 @@ from mvitac.nn.encoders import (
 )
 from mvitac.nn.losses import info_nce
 from mvitac.nn.momentum import Momentum
+from mvitac.registry import check_range
 from mvitac.system.threads import in_branches
 
 PARTS = {"vv": ("vision", "vision"), "tt": ("touch", "touch"), "vt": ("vision", "touch"), "tv": ("touch", "vision")}
@@ -81,20 +82,15 @@ class MViTacConfig(MethodConfig):
     """BatchNorm after the first layer of the heads, as in MoCo v3 and SimCLR v2. None in the paper."""
 
     def __post_init__(self) -> None:
-        self.check_fields(
-            positive=("temperature",),
-            weight=("lambda_inter", "lambda_sensor"),
-            share=("momentum",),
-            width=("out", "hidden"),
-        )
+        check_range(self, 1e-6, 1e6, "temperature")
+        check_range(self, 0, 1e6, "lambda_inter", "lambda_sensor")
+        check_range(self, 0, 1, "momentum")
+        check_range(self, 0, 0.99, "dropout")
+        check_range(self, 1, 65536, "out", "hidden")
         if not self.losses or len(set(self.losses)) < len(self.losses):
             raise ValueError(f"losses {self.losses}: give one or more of vv, tt, vt, tv, each once")
         if self.pairs == "all" and not self.both_ways:
-            raise ValueError(
-                "pairs 'all' needs each view as query and as key: give keys 'end-to-end', or pairs 'crossed'"
-            )
-        if not 0 <= self.dropout < 1:
-            raise ValueError(f"dropout {self.dropout}: give a probability in [0, 1)")
+            raise ValueError("pairs 'all' needs each view as query and key: give keys 'end-to-end', or pairs 'crossed'")
 
     @property
     def sensor_view(self) -> bool:
@@ -120,10 +116,8 @@ class MViTacConfig(MethodConfig):
     def build(self, spec: DataSpec, encoder: Encoders) -> "MViTac":
         possible = possible_losses(spec)
         if not set(self.losses) & set(possible):
-            raise ValueError(
-                f"losses {', '.join(self.losses)} need another modality than dataset {spec.name!r} has:"
-                f" give some of {', '.join(possible)}"
-            )
+            lacking = f"losses {', '.join(self.losses)}: dataset {spec.name!r} lacks a modality"
+            raise ValueError(f"{lacking}, give some of {', '.join(possible)}")
         if self.sensor_view and "touch" not in spec.modalities:
             raise ValueError(f"lambda_sensor {self.lambda_sensor}: dataset {spec.name!r} has no touch, leave it out")
         return MViTac(self, spec, encoder)
@@ -140,14 +134,9 @@ class Tower(nn.Module):
     def __init__(self, config: MViTacConfig, encoder: EncoderConfig, channels: int, frames: int) -> None:
         super().__init__()
         self.trunk = build_trunk(encoder, channels, frames)
-
-        def head() -> Head:
-            return Head(
-                num_features(self.trunk), config.hidden, config.out, dropout=config.dropout, norm=config.head_norm
-            )
-
-        self.intra = head()
-        self.inter = head()
+        sizes = num_features(self.trunk), config.hidden, config.out
+        self.intra = Head(*sizes, dropout=config.dropout, norm=config.head_norm)
+        self.inter = Head(*sizes, dropout=config.dropout, norm=config.head_norm)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         features = features_of(self.trunk, images)
@@ -173,17 +162,15 @@ class MViTac(Contrastive):
 
     def queries(self, batch: Views) -> Embeddings:
         """Eq. 4, 6, 9, 12."""
-        views = (0, 1) if self.config.both_ways else (0,)
-        return embed("q", self.query, batch, views, more=self.config.keys == "end-to-end")
+        return embed("q", self.query, batch, slice(None) if self.config.both_ways else slice(1))
 
     def keys(self, batch: Views) -> Embeddings:
         """Eq. 5, 7, 10, 13. End-to-end keys are the queries themselves, so there is nothing to add."""
-        views = (1, 0) if self.config.both_ways else (1,)
-        z = embed("k", self.key, batch, views, more=True)
+        z = embed("k", self.key, batch, slice(1, None))
         return z | {("both", m): positions for m, positions in batch.both.items()}
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
-        k = "q" if self.config.keys == "end-to-end" else "k"
+        k = "q" if self.config.both_ways else "k"
         losses = {}
         for part, (x, y) in PARTS.items():
             head = "intra" if x == y else "inter"
@@ -216,18 +203,15 @@ class MViTac(Contrastive):
             key.follow(self.config.momentum)  # type: ignore[operator]  # eq. 1-3
 
 
-def embed(name: str, towers: nn.ModuleDict, batch: Views, views: tuple[int, ...], *, more: bool) -> Embeddings:
+def embed(name: str, towers: nn.ModuleDict, batch: Views, views: slice) -> Embeddings:
     """Embeddings of ``views`` of each modality by both heads, keyed ``(name, modality, view, head)``.
-
-    With ``more``, also of the views after the first two (``MethodConfig.sensor_view``).
 
     On a CPU the two towers run side by side, except with dropout, which needs one order of random numbers.
     """
 
     def of(modality: str) -> Embeddings:
         z: Embeddings = {}
-        for view in (*views, *(range(2, len(batch.images[modality])) if more else ())):
-            images = batch.images[modality][view]
+        for view, images in list(enumerate(batch.images[modality]))[views]:
             z[name, modality, view, "intra"], z[name, modality, view, "inter"] = towers[modality](images)
         return z
 

@@ -16,6 +16,7 @@ from tyro.conf import Fixed
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
 from mvitac.nn.encoders import Encoders, Head, build_towers, trunks
+from mvitac.registry import check_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +36,8 @@ class SimCLRConfig(MethodConfig):
     """BatchNorm after the first layer of the head (as in the authors' code)."""
 
     def __post_init__(self) -> None:
-        self.check_fields(positive=("temperature",), width=("out", "hidden"))
+        check_range(self, 1e-6, 1e6, "temperature")
+        check_range(self, 1, 65536, "out", "hidden")
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "SimCLR":
         return SimCLR(self, spec, encoder)
@@ -59,9 +61,8 @@ class SimCLR(Contrastive):
     def __init__(self, config: SimCLRConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
-        self.towers = build_towers(
-            encoder, spec, lambda width: Head(width, config.hidden, config.out, norm=config.head_norm)
-        )
+        sizes = config.hidden, config.out
+        self.towers = build_towers(encoder, spec, lambda width: Head(width, *sizes, norm=config.head_norm))
 
     def queries(self, batch: Views) -> Embeddings:
         return {(m, i): tower(batch.images[m][i]) for m, tower in present(self.towers, batch) for i in (0, 1)}

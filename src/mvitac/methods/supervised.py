@@ -21,7 +21,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, DataSpec, Task
 from mvitac.methods.base import Method, MethodConfig, Views, with_sum
 from mvitac.nn.encoders import Encoders, build_trunk, features_of, num_features
-from mvitac.registry import unknown
+from mvitac.registry import check_range, unknown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,41 +32,33 @@ class LabelledConfig(MethodConfig):
     """Tasks to learn. Default: all tasks with classes; if the dataset has none, all tasks with values."""
     modalities: tuple[Literal["touch", "vision"], ...] = ()
     """Modalities to learn from. Default: all modalities of the dataset."""
-    labels: Literal["train", "train-and-val"] = "train-and-val"
-    """Splits whose labels are learned from. train-and-val: the rows that probes are fitted on. train: rows of train alone,
-    as in version 0.1.0."""
-
-    @property
-    def label_splits(self) -> tuple[str, ...]:
-        return ("train",) if self.labels == "train" else ("train", "val")
+    label_splits: ClassVar[tuple[str, ...]] = ("train", "val")
+    """The rows that probes are fitted on."""
 
     def training_rows(self, pack: Pack) -> np.ndarray:
         """Pack rows with a label to learn from, by the split of their task, and with the modalities to learn from."""
-        if self.labels == "train":
-            rows = super().training_rows(pack)
-        else:
-            modalities = self.modalities_of(pack.spec)
-            known = [pack.answered(task, *self.label_splits) for task in self.tasks_of(pack.spec)]
-            self.check_senses(pack, np.flatnonzero(pack.whole & np.any(known, axis=0)), modalities)
-            rows = np.flatnonzero(np.logical_and.reduce([pack.has(m) for m in modalities]))
-        labelled = {t.name: pack.answered(t, *self.label_splits)[rows] for t in self.tasks_of(pack.spec)}
-        for task, there in labelled.items():
-            if not there.any():
+        modalities = self.modalities_of(pack.spec)
+        known = {task.name: pack.answered(task, *self.label_splits) for task in self.tasks_of(pack.spec)}
+        labelled = np.any(list(known.values()), axis=0)
+        self.check_senses(pack, np.flatnonzero(pack.whole & labelled), modalities)
+        seen = np.all([pack.has(m) for m in modalities], axis=0)
+        for task, there in known.items():
+            if not there[seen].any():
                 raise ValueError(f"task {task!r} has no labelled rows to train on: choose a self-supervised --method")
-        return rows[np.logical_or.reduce(list(labelled.values()))]
+        return np.flatnonzero(seen & labelled)
 
     def tasks_of(self, spec: DataSpec) -> tuple[AnyTask, ...]:
-        """Tasks to learn. Raises ValueError if the dataset lacks one, or has none."""
+        """Tasks to learn; ValueError if the dataset lacks one, or has none."""
         known = {task.name: task for task in spec.all_tasks}
         for task in self.tasks:
             if task not in known:
-                raise ValueError(f"task {task!r} is not in dataset {spec.name!r}: it has {', '.join(known) or 'none'}")
+                raise unknown("task", task, known)
         if not known:
             raise ValueError(f"dataset {spec.name!r} has no labels and no values: choose a self-supervised method")
         return tuple(known[name] for name in self.tasks) or spec.tasks or spec.values
 
     def modalities_of(self, spec: DataSpec) -> tuple[str, ...]:
-        """The modalities to learn from, in the dataset's order. Raises ValueError if the dataset lacks one."""
+        """The modalities to learn from, in the dataset's order; ValueError if the dataset lacks one."""
         for modality in self.modalities:
             if modality not in spec.modalities:
                 raise unknown("modality", modality, spec.modalities)
@@ -77,13 +69,13 @@ class LabelledConfig(MethodConfig):
 
     def heads(self, spec: DataSpec, layers: Callable[[int], nn.Module]) -> dict[str, nn.Module]:
         """A head for each task to learn. ``layers`` creates one with this number of outputs."""
-        heads: dict[str, nn.Module] = {}
-        for task in self.tasks_of(spec):
+
+        def head(task: AnyTask) -> nn.Module:
             if isinstance(task, Task):
-                heads[task.name] = layers(len(task.classes))
-            else:
-                heads[task.name] = ValueHead(layers(len(task.targets)), len(task.targets))
-        return heads
+                return layers(len(task.classes))
+            return ValueHead(layers(len(task.targets)), len(task.targets))
+
+        return {task.name: head(task) for task in self.tasks_of(spec)}
 
 
 class ValueHead(nn.Module):
@@ -131,7 +123,7 @@ class SupervisedConfig(LabelledConfig):
     """Leave out some of these groups, on which settings are chosen: those of split val, else a fifth."""
 
     def __post_init__(self) -> None:
-        self.check_fields(width=("draw",))
+        check_range(self, 1, 65536, "draw")
         if not 0 < self.share <= 1:
             raise ValueError(f"share {self.share}: give a share of the groups, above 0, at most 1")
 
@@ -160,9 +152,7 @@ class SupervisedConfig(LabelledConfig):
         held = [name for name in spare if name in val]
         held = held if len(held) > 1 else spare[max(0, len(spare) - len(drawn) // 5) :]
         if self.hold_out and not held:
-            raise ValueError(
-                f"{len(drawn)} labelled {pack.spec.group_by}s are too few to hold some out and choose settings on them"
-            )
+            raise ValueError(f"{len(drawn)} labelled {pack.spec.group_by}s are too few to hold some out")
         return [name for name in drawn if name not in held], held
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "Supervised":
@@ -210,7 +200,7 @@ class Supervised(Method):
                 head.learn_scale(values[task])
 
     def encoders(self) -> dict[str, nn.Module]:
-        return dict(self.trunks.items())
+        return dict(self.trunks)
 
     def classifiers(self) -> dict[str, nn.Module]:
         return dict(zip(self.tasks, self.heads, strict=True))

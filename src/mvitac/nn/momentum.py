@@ -10,9 +10,9 @@ from torch import nn
 from mvitac.nn.encoders import is_locked
 
 
-def momentum_at(progress: float, start: float, end: float | None) -> float:
-    """Momentum m at ``progress`` (0 to 1) of a run: constant, or rising to ``end`` along a half cosine (BYOL, MoCo v3)."""
-    return start if end is None else end - (end - start) * (math.cos(math.pi * progress) + 1) / 2
+def momentum_at(progress: float, start: float) -> float:
+    """Momentum m at ``progress`` (0 to 1) of a run: from ``start`` to 1 along a half cosine (BYOL)."""
+    return 1 - (1 - start) * (math.cos(math.pi * progress) + 1) / 2
 
 
 class Momentum(nn.Module):

@@ -20,7 +20,6 @@ from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, PerFrame, build
 from mvitac.nn.positions import sin_cos_positions
 
 Senses = Literal["own", "both"]  # whether a predictor sees tokens of its own modality, or of both
-Shape = tuple[int | None, int | None]
 _GOLDEN, _MULTIPLIERS = -0x61C8864680B583EB, (-0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15)
 """The constants of SplitMix64 (Steele et al., OOPSLA 2014) as signed numbers."""
 
@@ -161,14 +160,6 @@ def _pass(blocks: nn.Sequential, tokens: Tensor, live: Tensor | None) -> Tensor:
     return tokens
 
 
-def check_predictor(name: str, width: int | None, depth: int | None) -> None:
-    """Raise ValueError for an impossible width or depth of a ``Predictor`` that the config calls ``name``."""
-    if width is not None and not (4 <= width <= 4096 and width % 4 == 0):
-        raise ValueError(f"{name}_width {width}: give a multiple of 4, at most 4096")
-    if depth is not None and not 1 <= depth <= 64:
-        raise ValueError(f"{name}_depth {depth}: give 1 to 64")
-
-
 class Predictor(nn.Module):
     """A narrow ViT that predicts something about hidden patches from visible ones (MAE's decoder, I-JEPA's predictor).
 
@@ -178,22 +169,21 @@ class Predictor(nn.Module):
         trunk: The trunk whose tokens it reads.
         out: Width of the predictions.
         other: The trunk of the other modality, if it also reads its tokens.
-        shape: Width and number of blocks. None = ``share`` of the trunk's, in whole heads of 32 features, up to ``most``.
+        share, most: Width and number of blocks are this share of the trunk's, in whole heads of 32 features, up to ``most``.
     """
 
     def __init__(
-        self, trunk: nn.Module, out: int, other: nn.Module | None, shape: Shape, share: float, most: tuple[int, int]
+        self, trunk: nn.Module, out: int, other: nn.Module | None, share: float, most: tuple[int, int]
     ) -> None:
         super().__init__()
         vit = vit_of(trunk)
-        width = shape[0] or min(most[0], 32 * max(1, round(vit.embed_dim * share / 32)))
-        depth = shape[1] or min(most[1], max(1, round(len(vit.blocks) * share)))
+        width = min(most[0], 32 * max(1, round(vit.embed_dim * share / 32)))
+        depth = min(most[1], max(1, round(len(vit.blocks) * share)))
         self.embed = nn.Linear(vit.embed_dim, width)
         self.other = nn.Linear(vit_of(other).embed_dim, width) if other else None
         self.mask_token = nn.Parameter(torch.zeros(1, 1, 1, width))
         norm: Any = partial(nn.LayerNorm, eps=1e-6)
-        heads = max(1, width // 32) if width % 32 == 0 else 1
-        self.blocks = nn.Sequential(*(Block(width, heads, qkv_bias=True, norm_layer=norm) for _ in range(depth)))
+        self.blocks = nn.Sequential(*(Block(width, width // 32, qkv_bias=True, norm_layer=norm) for _ in range(depth)))
         self.norm = norm(width)
         self.out = nn.Linear(width, out)
         nn.init.normal_(self.mask_token, std=0.02)

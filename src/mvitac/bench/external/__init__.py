@@ -1,4 +1,4 @@
-"""Encoders of other people, one file per owner. Importing this package imports and registers all of them."""
+"""Encoders of other people. Importing this package imports and registers all of their adapters."""
 
 from mvitac.bench.external.base import Adapter, Loaded
 from mvitac.bench.external.encoder import ExternalEncoder, Layout

@@ -1,28 +1,25 @@
 """The interface of adapters to other people's encoders, and the text that names an encoder.
 
     external:timm/resnet18.a1_in1k,size=112        adapter, what it opens, options
-    external:sparsh:sparsh_dino_base.safetensors   one file per owner
+    external:sparsh:sparsh_dino_base.safetensors   one adapter per owner
     external:model.onnx,mean=clip,std=clip         any TorchScript or ONNX file
 
-An adapter is one file: a subclass of ``Adapter`` whose fields are its options. No owner's code is used, and no owner's
-weights were at hand when the adapters were written: they are tested on small weights with the owners' names and shapes.
+An adapter is a subclass of ``Adapter`` whose fields are its options.
 """
 
-import copy
 import typing
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import torch
 from torch import nn
 
-from mvitac.bench.external.encoder import ExternalEncoder
 from mvitac.bench.external.preprocessing import CLIP, IMAGENET, PLAIN, Preprocessing
 from mvitac.registry import Registered, find, from_json, unknown
-from mvitac.system.files import digest_file, parse_json
+from mvitac.system.files import parse_json
 
 START = "external:"
 FILES = (".pt", ".ts", ".pth", ".onnx", ".safetensors")
@@ -30,7 +27,7 @@ UNKNOWN, NOTHING, RANDOM = "unknown", "nothing", "none (random weights)"
 STATISTICS = {"imagenet": IMAGENET, "clip": CLIP, "none": PLAIN}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Loaded:
     """What an adapter opened."""
 
@@ -88,17 +85,13 @@ class Adapter(Registered, ABC):
             raise ValueError(f"{START}{self.name}: {path} does not exist: give {self.expects}")
         return path
 
-    def refuse(self, why: str) -> ValueError:
-        """The error for a file of another kind."""
-        return ValueError(f"{self.place} is not for {START}{self.name} ({why}): give {self.expects}")
-
     def changed(self, made: Preprocessing) -> Preprocessing:
         """``made`` with the values that options give."""
         options = ("frames", "stride", "offset")
         changes: dict[str, Any] = {n: getattr(self, n) for n in options if getattr(self, n) is not None}
         for name, at in (("mean", 0), ("std", 1)):
             if text := getattr(self, name):
-                changes[name] = STATISTICS[text][at] if text in STATISTICS else _numbers(text, name, float, "/")
+                changes[name] = STATISTICS[text][at] if text in STATISTICS else _numbers(text, name, float, "/", 3)
         if self.background == "minus":
             changes.setdefault("offset", 0.5 if made.offset is None else made.offset)
         elif self.background == "none":
@@ -110,54 +103,18 @@ class Adapter(Registered, ABC):
         """Height and width that ``size`` asks for, by default ``usual``."""
         if not self.size:
             return usual
-        found: list[int] = list(_numbers(self.size, "size", int, "x"))
-        if len(found) > 2:
-            raise ValueError(f"size {self.size}: give one side or height x width, e.g. 224 or 320x240")
-        return found[0], found[-1]
+        text = self.size if "x" in self.size else f"{self.size}x{self.size}"
+        return typing.cast(tuple[int, int], _numbers(text, "size", int, "x", 2))
 
 
-def _numbers(text: str, name: str, kind: Callable[[str], Any], between: str) -> tuple[Any, ...]:
+def _numbers(text: str, name: str, kind: Callable[[str], Any], between: str, num: int) -> tuple[Any, ...]:
     try:
-        return tuple(kind(part) for part in text.split(between))
+        found = tuple(kind(part) for part in text.split(between))
     except ValueError:
-        raise ValueError(f"{name} {text!r}: give numbers with {between!r} between them") from None
-
-
-@dataclass(frozen=True)
-class OpenEncoder:
-    """An encoder that was named by text."""
-
-    text: str
-    adapter: Adapter
-    loaded: Loaded
-    encoder: ExternalEncoder
-
-    def untrained(self) -> "OpenEncoder | None":
-        """The same network with random weights; None if it has no weights here, or random ones already."""
-        network = self.loaded.network
-        if self.loaded.trained_on == NOTHING or not any(p.is_floating_point() for p in network.parameters()):
-            return None
-        network = randomised(network, self.adapter.seed)
-        loaded = replace(self.loaded, network=network, files=(), licence=RANDOM, trained_on=NOTHING)
-        encoder = ExternalEncoder(network, self.encoder.preprocessing, self.adapter.pool)
-        return OpenEncoder(self.text, self.adapter, loaded, encoder)
-
-
-def randomised(network: nn.Module, seed: int) -> nn.Module:
-    """A copy of ``network`` with random weights: matrices truncated normal (.02), convolutions He, scales 1, biases 0."""
-    network, generator = copy.deepcopy(network), torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for name, weight in network.named_parameters():
-            if weight.ndim > 3:
-                nn.init.kaiming_normal_(weight, generator=generator)
-            elif weight.ndim > 1:
-                nn.init.trunc_normal_(weight, std=0.02, generator=generator)
-            else:
-                weight.fill_(not name.endswith("bias"))
-        for name, value in network.named_buffers():
-            if name.endswith(("running_mean", "running_var")):
-                value.fill_(name.endswith("var"))
-    return network
+        found = ()
+    if len(found) != num:
+        raise ValueError(f"{name} {text!r}: give {num} numbers with {between!r} between them")
+    return found
 
 
 def seeded(build: Callable[[], nn.Module], seed: int) -> nn.Module:
@@ -165,21 +122,6 @@ def seeded(build: Callable[[], nn.Module], seed: int) -> nn.Module:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return build()
-
-
-def open_encoder(text: str) -> OpenEncoder:
-    """Open the encoder that ``text`` names (module docstring); ValueError if that is not possible."""
-    adapter = parse(text)
-    loaded = adapter.load()
-    given = {name: getattr(adapter, name) for name in ("licence", "trained_on") if getattr(loaded, name) == UNKNOWN}
-    given["title"] = adapter.title
-    loaded = replace(loaded, **{name: value for name, value in given.items() if value})
-    digests = [digest_file(file) for file in loaded.files]
-    try:
-        encoder = ExternalEncoder(loaded.network, adapter.changed(loaded.preprocessing), adapter.pool, f"{digests}")
-    except ValueError as error:
-        raise ValueError(f"{text}: {error}") from None
-    return OpenEncoder(text, adapter, loaded, encoder)
 
 
 def parse(text: str) -> Adapter:
@@ -193,23 +135,17 @@ def parse(text: str) -> Adapter:
     if name not in Adapter.choices or not place:
         known = [f"{START}{choice}{'/' if choice == 'timm' else ':'}..." for choice in Adapter.choices]
         raise unknown("encoder", text, [*known, f"{START}FILE ({', '.join(FILES)})"])
-    kind: Any = find(Adapter, name)
-    hints = typing.get_type_hints(kind)
-    known = [field.name.replace("_", "-") for field in fields(kind) if field.name != "place"]
+    hints = typing.get_type_hints(find(Adapter, name))
     given: dict[str, Any] = {}
-    for pair in pairs:
-        key, _, value = pair.partition("=")
-        if key not in known:
-            raise unknown(f"option of {START}{name}", key, known)
-        given[key.replace("-", "_")] = _value(hints[key.replace("-", "_")], value, key)
-    return kind(place=place, **given)
+    for key, _, value in (pair.partition("=") for pair in pairs):
+        key = key.replace("-", "_")
+        words = hints.get(key, str) is str or typing.get_origin(hints[key]) is Literal
+        given[key] = value if words else _number(value)
+    return from_json(Adapter, {**given, "name": name, "place": place}, START + name)
 
 
-def _value(annotation: Any, text: str, name: str) -> Any:
-    if annotation is str or typing.get_origin(annotation) is Literal:
-        return from_json(annotation, text, name)
+def _number(text: str) -> Any:
     try:
-        value = parse_json(text)
+        return parse_json(text)
     except ValueError:
-        raise ValueError(f"{name}={text}: give a number") from None
-    return from_json(annotation, value, name)
+        return text

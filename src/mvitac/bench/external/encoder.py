@@ -5,14 +5,14 @@ Shapes: B images, S sensors, F frames, D features, P places.
 
 import copy
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
-from mvitac.bench.external.preprocessing import Preprocessing
+from mvitac.bench.external.base import NOTHING, RANDOM, UNKNOWN, Adapter, Loaded, parse
 from mvitac.nn.encoders import num_features
-from mvitac.system.files import brief
+from mvitac.system.files import brief, digest_file
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,6 @@ class Plain(nn.Module):
 
     def forward_features(self, images: Tensor) -> Tensor:
         found = self.network(images)
-        if not isinstance(found, Tensor) or found.ndim not in (2, 3, 4):
-            shown = f"shape {list(found.shape)}" if isinstance(found, Tensor) else type(found).__name__
-            raise ValueError(
-                f"the network returned {shown}: return features [B, D], tokens [B, P, D] or maps [B, D, H, W]"
-            )
         return found[:, None] if found.ndim == 2 else found
 
     def forward(self, images: Tensor) -> Tensor:
@@ -54,33 +49,32 @@ class ExternalEncoder(nn.Module):
     """Features [B, S D] of raw images [B, C, H, W], uint8 or float in [0, 1]. Several sensors are encoded one by one.
 
     Args:
-        network: With the interface of timm's models: ``forward`` gives features [B, D], ``forward_features`` tokens
-            [B, P, D] (with ``num_prefix_tokens``) or a map [B, D, H, W].
-        preprocessing: Of its owner.
-        pool: mean: features are the mean of the places. cls: the first token. "": those of ``forward``.
-        about: What else decides the features, for their digest.
+        adapter: Its options.
+        loaded: What it opened. The network has the interface of timm's models: ``forward`` gives features [B, D],
+            ``forward_features`` tokens [B, P, D] (with ``num_prefix_tokens``) or a map [B, D, H, W].
 
     Raises:
         ValueError: If the network does not take such images.
     """
 
-    def __init__(self, network: nn.Module, preprocessing: Preprocessing, pool: str = "", about: str = "") -> None:
+    def __init__(self, adapter: Adapter, loaded: Loaded) -> None:
         super().__init__()
-        self.network, self.preprocessing, self.pool = network.eval().requires_grad_(False), preprocessing, pool
-        self.layout = Layout()
-        known = hashlib.sha256(f"{preprocessing} {pool} {about}".encode()).digest()
+        self.adapter, self.loaded, self.layout = adapter, loaded, Layout()
+        self.network = loaded.network.eval().requires_grad_(False)
+        self.preprocessing = adapter.changed(loaded.preprocessing)
+        digests = [digest_file(file) for file in loaded.files]
+        known = hashlib.sha256(f"{self.preprocessing} {adapter.pool} {digests}".encode()).digest()
         # A parameter, so that digests of the weights cover it and networks without weights have a device.
         self.identity = nn.Parameter(torch.frombuffer(bytearray(known), dtype=torch.uint8), requires_grad=False)
-        shape = preprocessing.input_shape()
+        shape = self.preprocessing.input_shape()
         try:
             with torch.no_grad():
                 found = self._pooled(torch.zeros(2, *shape))
+            if found.ndim != 2 or len(found) != 2 or not found.shape[1]:
+                raise ValueError(f"it returns {list(found.shape)} for two images, not [2, D]")
         except Exception as error:  # whatever the network raises
-            raise ValueError(
-                f"the network does not take images {list(shape)} ({brief(error)}): give its size and frames"
-            ) from None
-        if found.ndim != 2 or len(found) != 2 or not found.shape[1]:
-            raise ValueError(f"the network returned {list(found.shape)} for two images: expected features [2, D]")
+            why = f"the network does not take images {list(shape)} ({brief(error)})"
+            raise ValueError(f"{adapter.place}: {why}: give its size and frames") from None
         self.num_features = self.width = found.shape[1]
 
     def bound(self, layout: Layout) -> "ExternalEncoder":
@@ -88,6 +82,14 @@ class ExternalEncoder(nn.Module):
         made = copy.copy(self)
         made.layout, made.num_features = layout, self.width * layout.sensors
         return made
+
+    def untrained(self) -> "ExternalEncoder | None":
+        """The same network with random weights; None if it has no weights here, or random ones already."""
+        if self.loaded.trained_on == NOTHING or not any(p.is_floating_point() for p in self.network.parameters()):
+            return None
+        network = randomised(self.network, self.adapter.seed)
+        random = replace(self.loaded, network=network, files=(), licence=RANDOM, trained_on=NOTHING)
+        return ExternalEncoder(self.adapter, random)
 
     def forward(self, images: Tensor) -> Tensor:
         return self._pooled(self._prepared(images)).unflatten(0, (-1, self.layout.sensors)).flatten(1)
@@ -98,12 +100,38 @@ class ExternalEncoder(nn.Module):
         return self.preprocessing(each, self.layout.gain)
 
     def _pooled(self, x: Tensor) -> Tensor:
-        if not self.pool:
+        if not self.adapter.pool:
             return self.network(x).float()
         found = self.network.forward_features(x)  # type: ignore[operator]
         if found.ndim == 4:
-            if self.pool == "cls":
+            if self.adapter.pool == "cls":
                 raise ValueError("pool=cls needs a network with tokens: give pool=mean")
             return found.mean((2, 3) if found.shape[1] == num_features(self.network) else (1, 2)).float()
         front = int(self.network.num_prefix_tokens)  # type: ignore[arg-type]
-        return (found[:, 0] if self.pool == "cls" else found[:, front:].mean(1)).float()
+        return (found[:, 0] if self.adapter.pool == "cls" else found[:, front:].mean(1)).float()
+
+
+def randomised(network: nn.Module, seed: int) -> nn.Module:
+    """A copy of ``network`` with random weights: matrices truncated normal (.02), convolutions He, scales 1, biases 0."""
+    network, generator = copy.deepcopy(network), torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for name, weight in network.named_parameters():
+            if weight.ndim > 3:
+                nn.init.kaiming_normal_(weight, generator=generator)
+            elif weight.ndim > 1:
+                nn.init.trunc_normal_(weight, std=0.02, generator=generator)
+            else:
+                weight.fill_(not name.endswith("bias"))
+        for name, value in network.named_buffers():
+            if name.endswith(("running_mean", "running_var")):
+                value.fill_(name.endswith("var"))
+    return network
+
+
+def open_encoder(text: str) -> ExternalEncoder:
+    """Open the encoder that ``text`` names (``base``); ValueError if that is not possible."""
+    adapter = parse(text)
+    loaded = adapter.load()
+    given = {name: getattr(adapter, name) for name in ("licence", "trained_on") if getattr(loaded, name) == UNKNOWN}
+    given["title"] = adapter.title
+    return ExternalEncoder(adapter, replace(loaded, **{name: value for name, value in given.items() if value}))

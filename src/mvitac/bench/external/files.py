@@ -52,16 +52,15 @@ class File(Adapter):
         if file.suffix in (".safetensors", ".pth"):
             raise ValueError(f"{file} holds weights only: name their timm model with trunk=NAME, or an adapter")
         try:
-            network = OnnxNetwork(file) if file.suffix == ".onnx" else Plain(_torchscript(file), self.prefix)
+            opened = OnnxNetwork(file) if file.suffix == ".onnx" else _torchscript(file)
         except ImportError as error:
             raise ValueError(f"{file} needs {error.name}: pip install -e '.[export]' in mvitac's clone") from None
         except Exception as error:  # torch and onnxruntime have their own exceptions
             raise ValueError(f"{file} cannot be opened as {file.suffix} ({brief(error)})") from None
         made = Preprocessing()
-        if isinstance(network, OnnxNetwork):
-            made = replace(made, size=network.size or made.size)
-            network = Plain(network, self.prefix)
-        return Loaded(network=network, preprocessing=made, title=file.stem, files=(file,), source=file.name)
+        if isinstance(opened, OnnxNetwork):
+            made = replace(made, size=opened.size or made.size)
+        return Loaded(Plain(opened, self.prefix), made, file.stem, files=(file,), source=file.name)
 
 
 def _torchscript(file: Path) -> nn.Module:
@@ -103,32 +102,22 @@ class Python(Adapter):
     reads: Literal["touch", "vision", "both"] = "both"
 
     def load(self) -> Loaded:
-        factory = self._factory()
-        try:
-            made: Any = seeded(factory, self.seed)
-        except Exception as error:  # whatever the function raises
-            raise ValueError(f"{self.place}() failed ({type(error).__name__}: {brief(error)})") from None
-        if not (
-            isinstance(made, tuple) and len(made) == 2 and isinstance(made[0], nn.Module) and isinstance(made[1], dict)
-        ):
-            raise ValueError(f"{self.place}() returned a {type(made).__name__}: return a torch module and a dict")
-        network, given = made[0], dict(made[1])
-        about = {name: str(given.pop(name)) for name in ABOUT if name in given}
-        prefix = int(given.pop("prefix", 0))
-        if isinstance(size := given.get("size"), int):
-            given["size"] = (size, size)
-        made = from_json(Preprocessing, to_json(given), f"{self.place}()")
-        if not (hasattr(network, "forward_features") and hasattr(network, "num_features")):
-            network = Plain(network, prefix)
-        about = {"title": self.place, "source": self.place, **about}
-        return replace(Loaded(network=network, preprocessing=made, title=""), **about)
-
-    def _factory(self) -> Any:
         module, _, name = self.place.partition(":")
         sys.path.insert(0, str(Path.cwd()))  # as python -m does
         try:
-            return getattr(importlib.import_module(module), name)
-        except Exception as error:  # whatever the module raises
-            raise ValueError(f"{self.place} cannot be imported ({brief(error)}): give {self.expects}") from None
+            made: Any = seeded(getattr(importlib.import_module(module), name), self.seed)
+            network, given = made[0], dict(made[1])
+        except Exception as error:  # whatever the module raises, or returns
+            why = f"{type(error).__name__}: {brief(error)}"
+            raise ValueError(f"{self.place}() returns no torch module and dict ({why}): give {self.expects}") from None
         finally:
             sys.path.remove(str(Path.cwd()))
+        about = {"title": self.place, "source": self.place}
+        about |= {name: str(given.pop(name)) for name in ABOUT if name in given}
+        prefix = int(given.pop("prefix", 0))
+        if isinstance(size := given.get("size"), int):
+            given["size"] = (size, size)
+        preprocessing = from_json(Preprocessing, to_json(given), f"{self.place}()")
+        if not (hasattr(network, "forward_features") and hasattr(network, "num_features")):
+            network = Plain(network, prefix)
+        return Loaded(network, preprocessing, **about)

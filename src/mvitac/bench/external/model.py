@@ -12,8 +12,8 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor, nn
 
-from mvitac.bench.external.base import START, UNKNOWN, OpenEncoder, open_encoder
-from mvitac.bench.external.encoder import Layout
+from mvitac.bench.external.base import START, UNKNOWN
+from mvitac.bench.external.encoder import ExternalEncoder, Layout, open_encoder
 from mvitac.data.pack import Pack
 from mvitac.data.spec import MODALITIES, DataSpec, Window
 from mvitac.data.windows import windowed
@@ -23,8 +23,7 @@ from mvitac.system.files import digest_file
 
 PICTURES = DataSpec(
     name="images", vision_channels=3, touch_channels=3, tasks=(), group_by="image", licence=UNKNOWN, source=UNKNOWN
-)
-"""What an encoder is for until it is bound to data: single images."""
+)  # what an encoder is for until it is bound to data: single images
 
 
 class ExternalModel(Model):
@@ -43,45 +42,43 @@ class ExternalModel(Model):
     def __init__(
         self,
         text: str,
-        parts: dict[str, OpenEncoder],
+        parts: dict[str, ExternalEncoder],
         spec: DataSpec = PICTURES,
         stored: int = 0,
         notes: tuple[str, ...] = (),
     ) -> None:
         nn.Module.__init__(self)
-        self.text, self.parts, self.spec, self.notes = text, parts, spec, notes
-        self.name = " + ".join(dict.fromkeys(part.loaded.title for part in parts.values()))
-        self.stored = stored or max(self.sides(modality)[0] for modality in parts)
+        self.text, self.spec, self.notes = text, spec, notes
         gains = {"touch": 2.0 if spec.difference else 0.0, "vision": 0.0}
         if spec.window.minus_first:
             gains |= {m: 2.0 * max(1.0, gains[m]) for m in spec.window.of}
-        self.encoders = nn.ModuleDict()
+        self.parts: dict[str, ExternalEncoder] = {}
         for modality, part in parts.items():
             sensors = max(1, spec.channels(modality) // 3 // spec.frames(modality))
-            self.encoders[modality] = part.encoder.bound(Layout(sensors, spec.frames(modality), gains[modality]))
+            self.parts[modality] = part.bound(Layout(sensors, spec.frames(modality), gains[modality]))
+        self.name = " + ".join(dict.fromkeys(part.loaded.title for part in parts.values()))
+        self.stored = stored or max(self.sides(modality)[0] for modality in parts)
+        self.encoders = nn.ModuleDict(self.parts)
         self.projectors, self.classifiers, self.tasks, self.probes = nn.ModuleDict(), nn.ModuleList(), (), {}
         self.eval()
 
     def __repr__(self) -> str:
-        return f"ExternalModel({self.title}: {', '.join(f'{m} {e.num_features}' for m, e in self.encoders.items())})"
+        return f"ExternalModel({self.title}: {', '.join(f'{m} {e.num_features}' for m, e in self.parts.items())})"
 
     @property
     def run(self) -> NoReturn:  # type: ignore[override]
-        """External encoders have none."""
         raise ValueError(f"{self.text} has no run here: use it with `mvitac probe --encoder` or `embed`")
 
     @property
     def seed(self) -> int:
-        """Seed of the probes, and of random weights."""
         return next(iter(self.parts.values())).adapter.seed
 
     def sides(self, modality: str) -> tuple[int, int]:
-        """The larger side of the inputs of ``modality``."""
-        side = max(self.parts[modality].encoder.preprocessing.size)
+        side = max(self.parts[modality].preprocessing.size)
         return side, side
 
     def levels(self, modality: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        return self.parts[modality].encoder.preprocessing.mean, self.parts[modality].encoder.preprocessing.std
+        return self.parts[modality].preprocessing.mean, self.parts[modality].preprocessing.std
 
     @property
     def title(self) -> str:
@@ -103,29 +100,24 @@ class ExternalModel(Model):
         """
         parts = {m: part for m, part in self.parts.items() if m in pack.spec.modalities}
         if not parts:
-            raise ValueError(
-                f"{self.text} reads {' and '.join(self.parts)}, {pack.spec.name!r} has {', '.join(pack.spec.modalities)}:"
-                " give reads=touch, vision or both"
-            )
+            senses = f"{' and '.join(self.parts)}, {pack.spec.name!r} has {', '.join(pack.spec.modalities)}"
+            raise ValueError(f"{self.text} reads {senses}: give reads=touch, vision or both")
         notes = []
-        moving = {m: part for m, part in parts.items() if (p := part.encoder.preprocessing).frames > 1 and not p.still}
+        wants = {m: part.preprocessing for m, part in parts.items()}
+        moving = {m: want for m, want in wants.items() if want.frames > 1 and not want.still}
         if moving and not pack.spec.window.active:
-            asked = {(p.encoder.preprocessing.frames, p.encoder.preprocessing.stride) for p in moving.values()}
             try:
-                if len(asked) > 1:
-                    raise ValueError(
-                        "frames: the two encoders want other windows: give both the same frames and stride"
-                    )
+                if len(asked := {(want.frames, want.stride) for want in moving.values()}) > 1:
+                    raise ValueError("the two encoders want other windows: give both the same frames and stride")
                 frames, stride = asked.pop()
                 pack = windowed(pack, Window(frames=frames, stride=stride, of=tuple(moving)))
             except ValueError as error:
-                if any(part.adapter.stride is not None for part in moving.values()):
+                if any(parts[m].adapter.stride is not None for m in moving):
                     raise
                 notes.append(f"the current frame is repeated ({error})")
-        for modality, part in parts.items():
+        for modality, want in wants.items():
             window, sense = pack.spec.window, modality == "touch" and pack.spec.difference
-            difference = sense or (window.minus_first and modality in window.of)
-            if part.encoder.preprocessing.offset is not None and not difference:
+            if want.offset is not None and not (sense or (window.minus_first and modality in window.of)):
                 notes.append(f"{modality}: its owner subtracts a background, this data has none: images as they are")
         return ExternalModel(self.text, parts, pack.spec, pack.size, tuple(notes)), pack
 
@@ -141,9 +133,7 @@ class ExternalModel(Model):
     def _encode(self, modality: str, images: Tensor, for_heads: bool) -> Tensor:
         found = self.encoders[modality](images).float()
         if not torch.isfinite(found).all():
-            raise ValueError(
-                f"{self.text} gives NaN or infinite features of {modality}: check its weights, mean and std"
-            )
+            raise ValueError(f"{self.text} gives NaN or infinite features of {modality}: check weights, mean and std")
         return found
 
     def describe(self) -> dict[str, Any]:
@@ -154,28 +144,27 @@ class ExternalModel(Model):
             "seed": self.seed,
             "weights": self.weights_digest(),
             "notes": list(self.notes),
-            "encoders": {modality: self._described(modality, part) for modality, part in self.parts.items()},
+            "encoders": {modality: _described(part) for modality, part in self.parts.items()},
         }
 
-    def _described(self, modality: str, part: OpenEncoder) -> dict[str, Any]:
-        encoder = self.encoders[modality]
-        layout: Layout = encoder.layout  # type: ignore[assignment]
-        preprocessing = part.encoder.preprocessing
-        return {
-            "title": part.loaded.title,
-            "licence": part.loaded.licence,
-            "noncommercial": is_noncommercial(part.loaded.licence),
-            "source": part.loaded.source,
-            "trained_on": part.loaded.trained_on,
-            "files": {file.name: digest_file(file) for file in part.loaded.files},
-            "parameters": sum(p.numel() for p in part.loaded.network.parameters()),
-            "features": encoder.num_features,
-            "pool": part.adapter.pool or "owner's",
-            "preprocessing": to_json(preprocessing),
-            "sensors": layout.sensors,
-            "frames_given": layout.frames,
-            "background_subtracted": bool(layout.gain) and preprocessing.offset is not None,
-        }
+
+def _described(part: ExternalEncoder) -> dict[str, Any]:
+    loaded, layout, preprocessing = part.loaded, part.layout, part.preprocessing
+    return {
+        "title": loaded.title,
+        "licence": loaded.licence,
+        "noncommercial": is_noncommercial(loaded.licence),
+        "source": loaded.source,
+        "trained_on": loaded.trained_on,
+        "files": {file.name: digest_file(file) for file in loaded.files},
+        "parameters": sum(p.numel() for p in loaded.network.parameters()),
+        "features": part.num_features,
+        "pool": part.adapter.pool or "owner's",
+        "preprocessing": to_json(preprocessing),
+        "sensors": layout.sensors,
+        "frames_given": layout.frames,
+        "background_subtracted": bool(layout.gain) and preprocessing.offset is not None,
+    }
 
 
 def is_noncommercial(licence: str) -> bool:
@@ -188,16 +177,13 @@ def open_model(text: str) -> ExternalModel:
 
     ValueError if there is no such encoder, or two encoders read the same sense.
     """
-    texts = [START + part for part in text.removeprefix(START).split(f"+{START}")]
-    opened = [open_encoder(each) for each in texts]
-    parts: dict[str, OpenEncoder] = {}
+    opened = [open_encoder(START + part) for part in text.removeprefix(START).split(f"+{START}")]
+    parts: dict[str, ExternalEncoder] = {}
     taken = {part.adapter.reads for part in opened}
     for part in opened:
         reads = part.adapter.reads
         given = [m for m in MODALITIES if reads in (m, "both") and (reads == m or m not in taken)]
         if not given or set(given) & parts.keys() or len(opened) > 2:
-            raise ValueError(
-                f"{text}: each sense can have one encoder: give reads=touch to one, reads=vision to the other"
-            )
+            raise ValueError(f"{text}: each sense has one encoder: give reads=touch to one, reads=vision to the other")
         parts.update(dict.fromkeys(given, part))
     return ExternalModel(text, {m: parts[m] for m in MODALITIES if m in parts})

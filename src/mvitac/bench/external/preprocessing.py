@@ -12,6 +12,8 @@ import torch.nn.functional as F
 from timm.data.constants import IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD, OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 from torch import Tensor
 
+from mvitac.registry import check_range
+
 Three = tuple[float, float, float]
 PLAIN: tuple[Three, Three] = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 IMAGENET: tuple[Three, Three] = (IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD)
@@ -50,17 +52,9 @@ class Preprocessing:
     bicubic: bool = False
 
     def __post_init__(self) -> None:
-        if not all(8 <= side <= 1024 for side in self.size):
-            raise ValueError(f"size {self.size}: give sides of 8 to 1024 pixels")
-        if not 1 <= self.frames <= 64:
-            raise ValueError(f"frames {self.frames}: give 1 to 64")
-        if not (0 < self.stride < math.inf):
-            raise ValueError(f"stride {self.stride}: give a positive number")
-        numbers_ok = all(math.isfinite(m) for m in self.mean) and all(0 < s < math.inf for s in self.std)
-        if not (len(self.mean) == len(self.std) == 3 and numbers_ok):
-            raise ValueError(f"mean {self.mean}, std {self.std}: give three numbers each, std above 0")
-        if self.offset is not None and not 0 <= self.offset <= 1:
-            raise ValueError(f"offset {self.offset}: give 0 to 1; 0.5 keeps no contact grey")
+        check_range(self, 0, 1, *["offset"] * (self.offset is not None))
+        if min(*self.size, self.frames) < 1 or not 0 < min(self.stride, *self.std) < math.inf:
+            raise ValueError(f"size {self.size}, frames {self.frames}, stride {self.stride}, std {self.std}: 0 or less")
 
     def resized_to(self, size: tuple[int, int]) -> "Preprocessing":
         """The same for another input size; the margin of a centre crop grows with it."""

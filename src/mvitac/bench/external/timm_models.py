@@ -57,20 +57,15 @@ class Timm(Adapter):
             quick = self.place.replace("_clip_", "_clip_quickgelu_")
             raise ValueError(f"{self.place}: OpenAI's weights need QuickGELU: {quick}")
         known = {"pretrained": IMAGENET, "random": SCRATCH}
-        try:
-            network = seeded(partial(self._built, known.get(self.weights, self.weights)), self.seed)
-        except ValueError as error:  # in the words of this option
-            text = str(error).replace("--encoder.weights ", "weights=").replace("weights=scratch", "weights=random")
-            raise ValueError(text.replace("another --encoder.trunk", "the name of another")) from None
+        network = seeded(partial(self._built, known.get(self.weights, self.weights)), self.seed)
         cfg: dict[str, Any] = getattr(network, "pretrained_cfg", None) or {}
         usual = resolve_data_config(pretrained_cfg={"name": self.place, **cfg})
-        random, file = self.weights == "random", Path(self.weights)
-        named = self.weights in known
+        random, named, file = self.weights == "random", self.weights in known, Path(self.weights)
         page = f"https://huggingface.co/{cfg.get('hf_hub_id')}"
         return Loaded(
-            network=network,
-            preprocessing=Preprocessing(size=usual["input_size"][1:], mean=usual["mean"], std=usual["std"]),
-            title=f"{self.place}, {self.weights if named else file.name}",
+            network,
+            Preprocessing(size=usual["input_size"][1:], mean=usual["mean"], std=usual["std"]),
+            f"{self.place}, {self.weights if named else file.name}",
             files=() if named else (file,),
             licence=RANDOM if random else (named and cfg.get("license")) or UNKNOWN,
             source=imagenet.source(self.place) or page if self.weights == "pretrained" else self.weights,

@@ -5,7 +5,7 @@ Widths and depths are taken from the file. A head has 64 channels in every trans
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,15 +16,13 @@ from timm.models.resnet import BasicBlock, Bottleneck, ResNet
 from timm.models.vision_transformer import Block
 from torch import Tensor, nn
 
-from mvitac.bench.external.base import Adapter
 from mvitac.nn import weights
-from mvitac.nn.weights import misfit
+from mvitac.nn.weights import State, misfit
 
-Tensors = dict[str, Tensor]
 HEAD = 64  # channels of an attention head
 
 
-def read_tensors(file: Path) -> Tensors:
+def read_tensors(file: Path) -> State:
     """The tensors of a checkpoint, those below "state_dict" or "model" if it has such an entry (``nn.weights``)."""
     tensors = weights.read_tensors(file)
     for entry in ("state_dict.", "model."):
@@ -32,47 +30,38 @@ def read_tensors(file: Path) -> Tensors:
     return tensors
 
 
-def under(tensors: Tensors, start: str, names: Mapping[str, str] = {}) -> Tensors:
-    """Tensors whose name begins with ``start``, without it; leading parts of names are exchanged as in ``names``."""
+def under(tensors: State, start: str, names: Mapping[str, str] = {}) -> State:
+    """State whose name begins with ``start``, without it; leading parts of names are exchanged as in ``names``."""
     found = {name.removeprefix(start): value for name, value in tensors.items() if name.startswith(start)}
     for old, new in names.items():
         found = {re.sub(rf"^{re.escape(old)}(?=\.|$)", new, name): value for name, value in found.items()}
     return found
 
 
-def depth(tensors: Tensors, start: str = "blocks.") -> int:
+def depth(tensors: State, start: str = "blocks.") -> int:
     """Number of blocks: one more than the largest number after ``start``."""
     found = (re.match(rf"{re.escape(start)}(\d+)\.", name) for name in tensors)
     return 1 + max((int(match[1]) for match in found if match), default=-1)
 
 
-def shape(adapter: Adapter, tensors: Tensors, name: str, dims: int) -> tuple[int, ...]:
-    """Shape of a tensor of ``dims`` dimensions; refused if it is missing."""
-    if name not in tensors or tensors[name].ndim != dims:
-        raise adapter.refuse(f"it has no {name!r} of {dims} dimensions")
-    return tuple(tensors[name].shape)
-
-
-def fill(adapter: Adapter, network: nn.Module, tensors: Tensors) -> nn.Module:
-    """``network`` with exactly ``tensors`` as its weights; refused if names or shapes differ."""
+def fill(network: nn.Module, tensors: State) -> Any:
+    """``network`` with exactly ``tensors`` as its weights; ValueError if names or shapes differ."""
     if why := misfit(network.state_dict(), tensors):
-        raise adapter.refuse(why)
+        raise ValueError(why)
     network.load_state_dict(tensors)
     return network
 
 
-def from_clip(tensors: Tensors) -> Tensors:
+def from_clip(tensors: State) -> State:
     """Layers of Hugging Face's CLIP (``encoder.layers.N.self_attn.q_proj``) under the names of timm's blocks."""
-    found: Tensors = {}
+    found: State = {}
     for name, value in tensors.items():
         name = re.sub(r"^encoder\.layers\.", "blocks.", name)
         name = re.sub(r"\.layer_norm([12])\.", r".norm\1.", name).replace(".self_attn.out_proj.", ".attn.proj.")
         found[name.replace(".self_attn.", ".attn.")] = value
     for name in [name for name in found if ".attn.q_proj." in name]:
-        parts = [found.pop(name.replace("q_proj", f"{part}_proj"), None) for part in "qkv"]
-        if any(part is None for part in parts):
-            continue  # reported as missing
-        found[name.replace("q_proj", "qkv")] = torch.cat(parts)  # type: ignore[arg-type]
+        parts = [found.pop(name.replace("q_proj", f"{part}_proj")) for part in "qkv"]
+        found[name.replace("q_proj", "qkv")] = torch.cat(parts)
     return found
 
 
@@ -89,21 +78,21 @@ class Tower(nn.Module):
         fixed: Positions [1, places, D] that are computed. None: learned.
         eps: Of every normalisation.
         mean: Features are the mean of the places, not the first token.
-        head: Applied to the features.
+        head: Whether a normalisation and a linear layer follow the features.
         scale: If given, features have this length.
         block: Makes a block; default: timm's.
     """
 
     def __init__(
         self,
-        tensors: Tensors,
+        tensors: State,
         grid: tuple[int, int, int],
         *,
         placed: int = 1,
         fixed: Tensor | None = None,
         eps: float = 1e-6,
         mean: bool = False,
-        head: nn.Module | None = None,
+        head: bool = False,
         scale: float | None = None,
         block: Any = None,
     ) -> None:
@@ -126,7 +115,10 @@ class Tower(nn.Module):
         self.pre_norm = norm(width) if "pre_norm.weight" in tensors else nn.Identity()
         self.blocks = nn.ModuleList((block or usual)() for _ in range(depth(tensors)))
         self.norm = norm(width) if "norm.weight" in tensors else nn.Identity()
-        self.head = head or nn.Identity()
+        self.head = nn.Identity()
+        if head:
+            out, width = tensors["head.1.weight"].shape
+            self.head = nn.Sequential(norm(width), nn.Linear(width, out, bias="head.1.bias" in tensors))
 
     @property
     def size(self) -> tuple[int, int]:
@@ -167,31 +159,22 @@ def patches(size: tuple[int, int], patch: int) -> tuple[int, int]:
     return size[0] // patch, size[1] // patch
 
 
-def tower(adapter: Adapter, tensors: Tensors, *, time: int = 1, **options: Any) -> Tower:
-    """The ``Tower`` of ``tensors`` with learned positions over a square grid, at the size that ``adapter`` asks for."""
-    shape(adapter, tensors, "embed.weight", 5 if tensors.get("embed.weight", torch.zeros(0)).ndim == 5 else 4)
-    num = shape(adapter, tensors, "positions", 3)[1] - 1
+def tower(
+    tensors: State, sides: Callable[[tuple[int, int]], tuple[int, int]], *, time: int = 1, **options: Any
+) -> Tower:
+    """The ``Tower`` of ``tensors`` with learned positions over a square grid, at the size that ``sides`` says."""
+    num = tensors["positions"].shape[1] - 1
     side = math.isqrt(num // time)
     if num < 1 or side * side * time != num:
-        raise adapter.refuse(f"it has positions for {num} places, which is no square grid at {time} steps of time")
-    made = Tower(tensors, (time, side, side), **options)
-    fill(adapter, made, tensors)
-    return made if (size := adapter.sides(made.size)) == made.size else made.resize(size)
+        raise ValueError(f"positions for {num} places are no square grid at {time} steps of time")
+    made: Tower = fill(Tower(tensors, (time, side, side), **options), tensors)
+    return made if (size := sides(made.size)) == made.size else made.resize(size)
 
 
-def projection(tensors: Tensors, eps: float) -> nn.Sequential:
-    """A normalisation and a linear layer, of the sizes of ``head.0`` and ``head.1``."""
-    out, width = tensors["head.1.weight"].shape if "head.1.weight" in tensors else (1, 1)
-    return nn.Sequential(nn.LayerNorm(width, eps=eps), nn.Linear(width, out, bias="head.1.bias" in tensors))
-
-
-def resnet(adapter: Adapter, tensors: Tensors) -> nn.Module:
+def resnet(tensors: State) -> nn.Module:
     """timm's ResNet that has ``tensors`` under its names, without a classifier."""
     layers = tuple(depth(tensors, f"layer{i}.") for i in range(1, 5))
-    if 0 in layers:
-        raise adapter.refuse("it is no ResNet of four stages")
     kind: Any = Bottleneck if "layer1.0.conv3.weight" in tensors else BasicBlock
-    channels = tuple(shape(adapter, tensors, f"layer{i}.0.conv1.weight", 4)[0] for i in range(1, 5))
-    stem = shape(adapter, tensors, "conv1.weight", 4)
-    network = ResNet(kind, layers, num_classes=0, in_chans=stem[1], channels=channels)
-    return fill(adapter, network, tensors)
+    channels = tuple(len(tensors[f"layer{i}.0.conv1.weight"]) for i in range(1, 5))
+    stem = tensors["conv1.weight"].shape[1]
+    return fill(ResNet(kind, layers, num_classes=0, in_chans=stem, channels=channels), tensors)
