@@ -112,7 +112,7 @@ class Python(Adapter):
             raise ValueError(f"{self.place}() returns no torch module and dict ({why}): give {self.expects}") from None
         finally:
             sys.path.remove(str(Path.cwd()))
-        about = {"title": self.place, "source": self.place}
+        about: dict[str, Any] = {"title": self.place, "source": self.place}
         about |= {name: str(given.pop(name)) for name in ABOUT if name in given}
         prefix = int(given.pop("prefix", 0))
         if isinstance(size := given.get("size"), int):
