@@ -237,7 +237,7 @@ def test_onnx_torchscript_and_python_files(pack: Pack, tmp_path: Path, monkeypat
     [
         ("external:sparks:file.safetensors", "choose from external:.*sparsh"),
         ("external:timm/resnet19,weights=random", "unknown trunk 'resnet19'"),
-        ("external:timm/resnet18", "give a file as weights, or random ones"),
+        ("external:timm/resnet18", "give weights FILE, or scratch"),
         ("external:timm/vit_base_patch16_clip_224.openai", "clip_quickgelu_224.openai"),
         (f"{TINY},sice=32", "unknown field.*'sice'.*'size'"),
         (f"{TINY},size=0", "or less"),

@@ -11,8 +11,8 @@ import pytest
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
+from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
-from mvitac.data.several import JoinedPack
 from mvitac.data.source import Sample
 from mvitac.data.spec import DataSpec, Task
 from mvitac.datasets.pack import PackConfig

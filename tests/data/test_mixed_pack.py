@@ -12,8 +12,8 @@ import pytest
 
 from mvitac.cli.main import main
 from mvitac.data.images import fit
+from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
-from mvitac.data.several import MixedPack
 from mvitac.data.source import Sample
 from mvitac.data.spec import DataSpec, Target, ValueTask, Window
 from mvitac.data.windows import windowed

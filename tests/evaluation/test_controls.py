@@ -47,6 +47,8 @@ def test_frozen_trunks_are_imagenet_and_files_that_runs_started_from() -> None:
     started = replace(run, encoder=run.encoder.changed(weights="b.pth"))
     found = frozen_trunks([run, started, started], 72)
     assert [name for name, _ in found] == ["imagenet", "start"] and found[1][1].encoder == started.encoder
+    large = replace(started, augment=replace(run.augment, whole=48))
+    assert frozen_trunks([run, large], 72)[1][1].augment.whole_of("touch") == 48  # as that run saw them
     (_, control), *rest = frozen_trunks([run], 500)
     assert not rest and {control.encoder[m].trunk for m in ("vision", "touch")} == {"tf_efficientnet_lite0"}
     assert {control.augment.whole_of(m) for m in ("vision", "touch")} == {128}  # as stored, up to here

@@ -17,9 +17,9 @@ from PIL import Image
 import mvitac
 from mvitac.cli.main import main
 from mvitac.data.build import build
+from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
 from mvitac.data.row_hashes import image_sums, known_images, number_hint
-from mvitac.data.several import JoinedPack
 from mvitac.data.source import Sample
 from mvitac.data.spec import DataSpec
 from mvitac.datasets.pack import ON_VAL, PackConfig

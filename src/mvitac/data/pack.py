@@ -48,7 +48,7 @@ class Pack:
     """
 
     parts: "Mapping[str, Pack]" = MappingProxyType({})
-    """Name -> pack, for several packs that are opened as one (``data/several.py``)."""
+    """Name -> pack, for several packs that are opened as one (``data/several``)."""
 
     def __init__(self, path: str | Path, *, verify: bool = True) -> None:
         """Open and check the pack at ``path``; ``verify`` also recomputes the image digests (about 1 s per GB)."""

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
+from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
-from mvitac.data.several import MixedPack
 from mvitac.data.spec import check_request
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import PackConfig

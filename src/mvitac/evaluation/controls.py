@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import AnyTask, DataSpec, Task, ValueTask
+from mvitac.data.spec import MODALITIES, AnyTask, DataSpec, Task, ValueTask
 from mvitac.evaluation.probe import (
     ProbeSplit,
     names_in,
@@ -164,22 +164,17 @@ def frozen_trunks(runs: Sequence[Run], stored: int) -> list[tuple[str, Run]]:
     ImageNet is left out where no weights are installed or cached (``imagenet.source``). It sees images as large as the
     runs do, or as they are ``stored`` [px], up to ``IMAGENET_SIDE``. Other people's encoders alone have no such row.
     """
-    if not runs:
-        return []
-    first = replace(runs[0], method=SimCLRConfig())  # its heads are not read; it takes any trunk and modality
-    found = {run.encoder: "start" for run in runs if {_file(run.encoder.vision), _file(run.encoder.touch)} != {""}}
-    named = [(name, replace(first, encoder=encoder)) for encoder, name in found.items()]
-    trunks = {m: imagenet_trunk(first.encoder[m]) for m in ("vision", "touch")}
-    if trunks["vision"] and trunks["touch"]:
-        sides = {m: max(first.augment.whole_of(m), min(stored, IMAGENET_SIDE)) for m in trunks}
-        views = {m: replace(first.augment.of(m), whole=side) for m, side in sides.items()}
-        pretrained = Encoders(vision=trunks["vision"], touch=trunks["touch"])
-        return [("imagenet", replace(first, encoder=pretrained, augment=replace(first.augment, **views))), *named]
-    return named
-
-
-def _file(encoder: EncoderConfig) -> str:
-    return "" if encoder.weights in (IMAGENET, SCRATCH) else encoder.weights
+    # The heads of SimCLR are not read; it takes any trunk and modality.
+    runs = [replace(run, method=SimCLRConfig()) for run in runs]
+    from_file = [run for run in runs if not {run.encoder[m].weights for m in MODALITIES} <= {IMAGENET, SCRATCH}]
+    found = [("start", run) for run in {run.encoder: run for run in reversed(from_file)}.values()]
+    trunks = {m: imagenet_trunk(run.encoder[m]) for run in runs[:1] for m in MODALITIES}
+    if runs and (vision := trunks["vision"]) and (touch := trunks["touch"]):
+        views = runs[0].augment
+        sides = {m: max(views.whole_of(m), min(stored, IMAGENET_SIDE)) for m in MODALITIES}
+        views = replace(views, **{m: replace(views.of(m), whole=side) for m, side in sides.items()})
+        found.append(("imagenet", replace(runs[0], encoder=Encoders(vision=vision, touch=touch), augment=views)))
+    return found[::-1]
 
 
 def imagenet_trunk(encoder: EncoderConfig) -> EncoderConfig | None:

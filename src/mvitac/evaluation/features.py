@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
-from mvitac.data.several import JoinedPack
 from mvitac.evaluation.pack_features import pack_features
 from mvitac.model import Model
 from mvitac.system.files import cache_dir, digest, write_atomic

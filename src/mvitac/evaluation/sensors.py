@@ -11,9 +11,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Pack
-from mvitac.data.several import JoinedPack
 from mvitac.data.spec import listed
 from mvitac.evaluation import diagnostics
 from mvitac.evaluation.classifiers import fit_linear

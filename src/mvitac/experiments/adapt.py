@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
-from mvitac.data.several import JoinedPack
 from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.evaluate import check_channels, check_unseen
 from mvitac.evaluation.leaks import Scored, Source, read_sources

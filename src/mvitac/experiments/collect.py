@@ -20,7 +20,7 @@ import numpy as np
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask
-from mvitac.evaluation.controls import Records, controls_of
+from mvitac.evaluation.controls import Records, controls_of, frozen_trunks
 from mvitac.evaluation.encoders import open_encoders, probe_encoders
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
 from mvitac.experiments.jobs import Job, Work
@@ -164,7 +164,8 @@ def _controls(work: Work, out: Path, session: ProbeConfig) -> tuple[Records, Rec
     if not session.controls:
         return [], []
     runs = [job.run for job in work.jobs if job.label == work.plan.reference] or [work.jobs[0].run]
-    key = digest([to_json(session), work.pack.digest, to_json(work.pack.spec), [run.digest() for run in runs]])
+    frozen = [name for name, _ in frozen_trunks(runs, work.pack.size)]  # weights may be installed later
+    key = digest([to_json(session), work.pack.digest, to_json(work.pack.spec), [run.digest() for run in runs], frozen])
     path = out / "controls.json"
     if path.exists() and (kept := read_json(path, "the controls"))["key"] == key:
         return kept["records"], kept["retrieval"]

@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
-from mvitac.data.several import JoinedPack
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs, stored_result
 from mvitac.evaluation.probe import probe_model
 from mvitac.evaluation.scores import summarise

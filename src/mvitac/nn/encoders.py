@@ -86,7 +86,7 @@ class EncoderConfig:
     features are averaged. attention: their weighted mean, with weights learned from the features and the frame's age."""
     locked: bool = False
     """Keep the trunk as it starts; its heads and the other trunk are trained (LiT, arXiv:2111.07991)."""
-    keep_norms: Fixed[bool] = False
+    keep_norms: bool = False
     """BatchNorm keeps the statistics that the trunk starts with, also for the images of training."""
     lr_scale: float = 1.0
     """Learning rate of the trunk relative to that of its heads, e.g. .1 to change pretrained weights slowly."""

