@@ -55,7 +55,9 @@ def probe(study: Study) -> list[Markup]:
             " is no better than their mean, and less is worse."
         )
     if {r["source"] for r in records} - set(study.sources):
-        intro += " Grey bars are controls: the same probe on frozen ImageNet and untrained trunks, pixels, and the border."
+        intro += (
+            " Grey bars are controls: the same probe on frozen ImageNet and untrained trunks, pixels, and the border."
+        )
     return [html.paragraph(intro), html.grid(drawn), *numbers]
 
 
