@@ -32,7 +32,7 @@ from mvitac.evaluation.intervals import interval
 from mvitac.evaluation.score_text import cell_text, columns_of
 from mvitac.evaluation.scores import summarise
 from mvitac.experiments.plan import Plan, Row
-from mvitac.experiments.table import lines_of
+from mvitac.experiments.table import Line, lines_of
 from mvitac.experiments.table_formats import latex, markdown
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.recipes import recipe
@@ -293,14 +293,15 @@ def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
 
 def test_the_comparison_sorts_methods_and_shares_the_palette() -> None:
     """Best method on top, controls below all methods, one colour per modality in every figure."""
-    dots = [
-        figures.Dot("weak", "touch", False, {"mean": 0.2, "low": 0.1, "high": 0.3, "printed": None, "leak": "3 of 4"}),
-        figures.Dot("strong", "touch", False, {"mean": 0.3, "low": 0.2, "high": 0.4, "printed": None}),
-        figures.Dot("strong", "both", False, {"mean": 0.6, "low": 0.5, "high": 0.7, "printed": 0.65}),
-        figures.Dot("pixels", "touch", True, {"mean": 0.9, "low": 0.8, "high": 1.0, "printed": None}),
-        figures.Dot("majority", "none", True, {"mean": 0.1, "low": 0.1, "high": 0.1, "printed": None}),
+    cells = [
+        ("weak", "touch", False, {"mean": 0.2, "low": 0.1, "high": 0.3, "printed": None, "leak": "3 of 4"}),
+        ("strong", "touch", False, {"mean": 0.3, "low": 0.2, "high": 0.4, "printed": None}),
+        ("strong", "both", False, {"mean": 0.6, "low": 0.5, "high": 0.7, "printed": 0.65}),
+        ("pixels", "touch", True, {"mean": 0.9, "low": 0.8, "high": 1.0, "printed": None}),
+        ("majority", "none", True, {"mean": 0.1, "low": 0.1, "high": 0.1, "printed": None}),
     ]
-    axes = figures.comparison({"task": dots}).axes[0]
+    lines = [Line(source, modality, {"task": cell}, control) for source, modality, control, cell in cells]
+    axes = figures.comparison(lines).axes[0]
     assert [label.get_text() for label in axes.get_yticklabels()] == ["pixels", "weak", "strong"]  # from below
     assert [(text.get_text(), text.xy[0]) for text in axes.texts] == [("LEAK", 20)]
     handles, labels = axes.get_legend_handles_labels()

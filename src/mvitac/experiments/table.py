@@ -13,19 +13,21 @@ from mvitac.evaluation.value_scores import one_target
 from mvitac.experiments.plan import ONE_ROW, Plan
 from mvitac.registry import from_json
 
-Cell = dict[str, Any]
-"""A cell of ``scores.summarise``, in 0 .. 1, with "printed" (the paper's number, or None) and "difference" to the reference
-row: mean, low, high, p (``paired_difference``), or None."""
-
 
 @dataclass(frozen=True)
 class Line:
-    """One line of the table: a source at one modality, with a cell per task."""
+    """One line of the table: a source at one modality. ``cells``: task -> cell of ``scores.summarise``, in 0 .. 1, with
+    "printed" (the paper's number, or None) and "difference" to the reference row (``paired_difference``, or None)."""
 
     source: str
     modality: str
-    cells: dict[str, Cell]
+    cells: dict[str, dict[str, Any]]
     control: bool
+
+
+def plan_of(result: dict[str, Any]) -> Plan:
+    """The plan of a result."""
+    return from_json(Plan, result["plan"], "plan")
 
 
 def lines_of(result: dict[str, Any], probe: str | None = None) -> list[Line]:
@@ -33,20 +35,18 @@ def lines_of(result: dict[str, Any], probe: str | None = None) -> list[Line]:
 
     The paper's numbers stand beside scores of the same split, positives and probe only (``_printed``).
     """
-    plan: Plan = from_json(Plan, result["plan"], "plan")
+    plan = plan_of(result)
     probe = probe or plan.probes[0]
-    records = by_cell(result["records"], probe)
-    tasks = list(dict.fromkeys(task for task, _, _ in records))
+    records, summary = by_cell(result["records"], probe), summarise(result["records"], probe)
     rows = [name for label in result["rows"] for name in (label, label + END_TO_END)]
     found = {source for _, _, source in records}
     own = sorted(found - set(rows) - set(CONTROLS))  # the data's own controls
     controls = [*(s for s in CONTROLS[:-2] if s in found), *own, *(s for s in CONTROLS[-2:] if s in found)]
-    summary = summarise(result["records"], probe)
     lines = []
     for source in (*rows, *controls):
         for modality in MODALITY_ORDER:
             cells = {}
-            for task in tasks:
+            for task in dict.fromkeys(task for task, _, _ in records):
                 if mine := records.get((task, modality, source)):
                     against = records.get((task, modality, plan.reference)) if source != plan.reference else None
                     trained = (task, modality, source + END_TO_END) in records
@@ -55,19 +55,17 @@ def lines_of(result: dict[str, Any], probe: str | None = None) -> list[Line]:
                     beside = {"printed": paper, "difference": paired_difference(mine, against) if against else None}
                     cells[task] = {**summary[task][modality][source], **beside}
             if cells:
-                lines.append(Line(source, modality, cells, control=source in controls))
+                lines.append(Line(source, modality, cells, source in controls))
     return lines
 
 
 def target_lines(result: dict[str, Any], probe: str | None = None) -> dict[str, list[Line]]:
     """Of each task with values, its lines with a cell for each target instead of each task."""
-    found: dict[str, list[Line]] = {}
-    values = [record for record in result["records"] if "targets" in record]
-    for task in dict.fromkeys(record["task"] for record in values):
-        mine = [record for record in values if record["task"] == task]
-        split = [{**one_target(r, t), "task": each["name"]} for r in mine for t, each in enumerate(r["targets"])]
-        found[task] = lines_of({**result, "records": split}, probe)
-    return found
+    found: dict[str, list[dict[str, Any]]] = {}
+    for record in result["records"]:
+        for t, target in enumerate(record.get("targets", ())):
+            found.setdefault(record["task"], []).append({**one_target(record, t), "task": target["name"]})
+    return {task: lines_of({**result, "records": records}, probe) for task, records in found.items()}
 
 
 def as_printed(result: dict[str, Any], plan: Plan) -> bool:
@@ -78,13 +76,11 @@ def as_printed(result: dict[str, Any], plan: Plan) -> bool:
 
 def _printed(result: dict[str, Any], plan: Plan, task: str, modality: str, source: str) -> float | None:
     """The paper's number, if it has one for this split, of positives from the same image."""
-    if not as_printed(result, plan):
-        return None
     label = source.removesuffix(END_TO_END)
-    printed = {row.label: row.printed for row in plan.rows}.get(label, {}).get(modality, {})
     pairs = {cost["row"]: cost["pairs_of"] for cost in result["cost"]}
     if source == "majority":
         printed = plan.printed_majority
-    elif pairs.get(label) != ONE_ROW:
-        return None
-    return printed[task] / 100 if task in printed else None
+    else:
+        printed = {row.label: row.printed for row in plan.rows}.get(label, {}).get(modality, {})
+        printed = printed if pairs.get(label) == ONE_ROW else {}
+    return printed[task] / 100 if as_printed(result, plan) and task in printed else None

@@ -14,8 +14,6 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
@@ -135,40 +133,30 @@ def _bar(axes: Axes, y: float, source: str, cell: Mapping[str, Any], hue: str, l
     axes.annotate(percent(cell["mean"]) + leak_mark(cell.get("leak", "")), (high, y), xytext=(5, 0), **look)
 
 
-@dataclass(frozen=True)
-class Dot:
-    """A score of one source at one modality ("none" = a control without features)."""
-
-    source: str
-    modality: str
-    control: bool
-    cell: Mapping[str, Any]  # mean, low, high, printed (may be None); "targets" if the score is R2
-
-
 @matplotlib.rc_context({**STYLE, "font.size": 10})
-def comparison(panels: Mapping[str, Sequence[Dot]]) -> Figure:
-    """A panel per task, a line per source, a dot with its 95 % interval per modality.
+def comparison(lines: Sequence[Any]) -> Figure:
+    """A panel per task, a row per source, a dot with its 95 % interval per modality. Crosses are the paper's numbers.
 
-    Methods are sorted by their best score in the first task, the controls follow. Crosses are the paper's numbers.
+    ``lines`` are those of a table (``experiments.table.Line``). Methods are sorted by their best score in the first task,
+    the controls follow.
     """
-    dots = [dot for panel in panels.values() for dot in panel if dot.modality != "none"]
+    tasks = list(dict.fromkeys(task for line in lines for task in line.cells))
     best: dict[tuple[bool, str], float] = {}
-    for dot in dots:
-        key = dot.control, dot.source
-        best[key] = max(best.get(key, -math.inf), dot.cell["mean"] if dot in next(iter(panels.values())) else -math.inf)
+    for line in (line for line in lines if line.modality != "none"):
+        score = line.cells[tasks[0]]["mean"] if tasks[0] in line.cells else -math.inf
+        best[line.control, line.source] = max(best.get((line.control, line.source), -math.inf), score)
     rows = [source for _, source in sorted(best, key=lambda key: (not key[0], best[key]))]  # from below
     names = [textwrap.fill(name, 40, max_lines=2, placeholder=" …") for name in rows]
-    figure = Figure(figsize=(3.4 + 3.2 * len(panels), 1.5 + 0.42 * len(rows)))
-    each = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    for axes, (task, panel) in zip(each, panels.items(), strict=True):
+    figure = Figure(figsize=(3.4 + 3.2 * len(tasks), 1.5 + 0.42 * len(rows)))
+    for axes, task in zip(figure.subplots(1, len(tasks), sharey=True, squeeze=False)[0], tasks, strict=True):
         axes.set_title(task)
-        for dot in panel:
-            _dot(axes, dot, rows)
+        cells = [(line.source, line.modality, line.cells[task]) for line in lines if task in line.cells]
+        for source, modality, cell in cells:
+            _dot(axes, source, modality, cell, rows)
         axes.set_yticks(range(len(rows)), names, color=colour("ink"))
         axes.set_ylim(-0.7, len(rows) - 0.3)
-        controls = sum(control for control, _ in best)
-        axes.axhline(controls - 0.5, color=colour("soft"), linewidth=0.7)
-        axes.set_xlabel(f"{'R2' if 'targets' in panel[0].cell else 'accuracy'} %")
+        axes.axhline(sum(control for control, _ in best) - 0.5, color=colour("soft"), linewidth=0.7)
+        axes.set_xlabel(f"{'R2' if 'targets' in cells[0][2] else 'accuracy'} %")
         axes.grid(axis="x")
         axes.spines["left"].set_visible(False)
     entries = {t: h for axes in figure.axes for h, t in zip(*axes.get_legend_handles_labels(), strict=True)}
@@ -177,24 +165,23 @@ def comparison(panels: Mapping[str, Sequence[Dot]]) -> Figure:
     return figure
 
 
-def _dot(axes: Axes, dot: Dot, rows: Sequence[str]) -> None:
-    mean, low = dot.cell["mean"], dot.cell["low"]
-    if dot.modality == "none":
-        if dot.source in ONE_ANSWER:
-            at = 100 * max(LEAST, mean)
-            axes.axvline(at, color=colour("soft"), linewidth=1, linestyle=ONE_ANSWER[dot.source], label=dot.source)
+def _dot(axes: Axes, source: str, modality: str, cell: Mapping[str, Any], rows: Sequence[str]) -> None:
+    mean, low = cell["mean"], cell["low"]
+    at = 100 * max(LEAST, mean)
+    if modality == "none":
+        if source in ONE_ANSWER:
+            axes.axvline(at, color=colour("soft"), linewidth=1, linestyle=ONE_ANSWER[source], label=source)
         return
-    hue = colour(MODALITY_HUES[dot.modality])
-    y = rows.index(dot.source) + {"touch": 0.22, "vision": 0.0, "both": -0.22}[dot.modality]
+    hue = colour(MODALITY_HUES[modality])
+    y = rows.index(source) + {"touch": 0.22, "vision": 0.0, "both": -0.22}[modality]
     if low is not None:
-        axes.plot([100 * max(LEAST, v) for v in (low, dot.cell["high"])], [y, y], color=hue, linewidth=1.6)
+        axes.plot([100 * max(LEAST, v) for v in (low, cell["high"])], [y, y], color=hue, linewidth=1.6)
     marker = "o" if mean >= LEAST else "<"  # R2 may be lower than the axis goes
-    axes.plot(100 * max(LEAST, mean), y, marker, markersize=4.5, color=hue, label=dot.modality)
-    if mark := leak_mark(dot.cell.get("leak", "")).strip():
-        place = (100 * max(LEAST, mean), y)
-        axes.annotate(mark, place, (5, 0), textcoords="offset points", va="center", fontsize=7, color=colour("ink"))
-    if dot.cell.get("printed") is not None:
-        axes.plot(100 * dot.cell["printed"], y, "x", markersize=6, color=hue, alpha=0.6, label="printed")
+    axes.plot(at, y, marker, markersize=4.5, color=hue, label=modality)
+    if mark := leak_mark(cell.get("leak", "")).strip():
+        axes.annotate(mark, (at, y), (5, 0), textcoords="offset points", va="center", fontsize=7, color=colour("ink"))
+    if cell.get("printed") is not None:
+        axes.plot(100 * cell["printed"], y, "x", markersize=6, color=hue, alpha=0.6, label="printed")
 
 
 @dataclass(frozen=True)
@@ -299,10 +286,9 @@ def feature_map(title: str, points: np.ndarray, labels: np.ndarray, classes: Seq
     return figure
 
 
-@matplotlib.rc_context(STYLE)
-def _print(figure: Figure, canvas: type[FigureCanvasAgg | FigureCanvasSVG], face: str, **options: Any) -> bytes:
-    """Print the figure with ``canvas``. It is laid out once for all canvases; savefig would repeat that."""
-    figure.set_facecolor(face)
+@matplotlib.rc_context({**STYLE, "svg.hashsalt": "mvitac"})  # the same figure is the same file
+def _print(figure: Figure, kind: str, metadata: dict[str, Any], **options: Any) -> bytes:
+    """Print the figure. It is laid out once for all kinds of file; savefig alone would repeat that."""
     for axes in figure.axes:
         axes.set_facecolor("none")
     buffer = io.BytesIO()
@@ -311,19 +297,17 @@ def _print(figure: Figure, canvas: type[FigureCanvasAgg | FigureCanvasSVG], face
         if (engine := figure.get_layout_engine()) is not None:
             engine.execute(figure)
             figure.set_layout_engine("none")
-        printed = canvas(figure)
-        (printed.print_svg if isinstance(printed, FigureCanvasSVG) else printed.print_png)(buffer, **options)
+        figure.savefig(buffer, format=kind, metadata=metadata, **options)
     return buffer.getvalue()
 
 
 def to_png(figure: Figure, dpi: int = 200) -> bytes:
     """The figure as a PNG on white."""
     figure.set_dpi(dpi)
-    return _print(figure, FigureCanvasAgg, "white", metadata={"Software": None})
+    return _print(figure, "png", {"Software": None}, facecolor="white", dpi=dpi)
 
 
 def to_svg(figure: Figure) -> str:
     """The figure as the address of an image for HTML."""
     metadata = dict.fromkeys(("Creator", "Date", "Format", "Type"))
-    with matplotlib.rc_context({"svg.hashsalt": "mvitac"}):  # the same figure is the same file
-        return data_uri(_print(figure, FigureCanvasSVG, "none", metadata=metadata), "svg+xml")
+    return data_uri(_print(figure, "svg", metadata, facecolor="none"), "svg+xml")
