@@ -25,7 +25,7 @@ from mvitac.evaluation.classifiers import fit_papers, train_heads
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.probe import probe_all, probe_features, probe_model, split_rows
 from mvitac.evaluation.retrieval import cross_modal
-from mvitac.evaluation.run_names import _places
+from mvitac.evaluation.run_names import _places, names_of
 from mvitac.evaluation.scores import summarise
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model_files import fresh, load
@@ -33,6 +33,8 @@ from mvitac.recipes import recipe
 from mvitac.report.report import open_runs
 from mvitac.report.tables import print_retrieval, print_summary
 from mvitac.run import Optim
+from mvitac.system.device import Hardware
+from mvitac.training import setup
 from mvitac.training.loop import train
 from support.toy import Toy, toy_pack
 
@@ -294,6 +296,18 @@ def test_runs_of_other_settings_are_no_seeds_of_one_another(runs: list[Path], tm
     again = shutil.copytree(runs[0], tmp_path / "again")
     with pytest.raises(ValueError, match="the same run"):
         probe_runs([*runs, again], session)
+
+
+def test_seeds_whose_automatic_precision_differs_are_seeds_of_one_run(pack: Pack, tmp_path: Path) -> None:
+    """Noise of the clock may give one seed bf16 and the next fp32."""
+    run, paths = replace(recipe("smoke", PackConfig(path=pack.path)), steps=1, precision="auto"), []
+    for seed in (0, 1):
+        with pytest.MonkeyPatch.context() as patch:
+            found = Hardware(torch.device("cpu"), ("fp32", "bf16")[seed], "")
+            patch.setattr(setup, "_hardware", lambda *_, found=found: found)
+            paths.append(train(replace(run, seed=seed), tmp_path / f"s{seed}", quiet=True))
+    models = [load(path) for path in paths]
+    assert [m.run.precision for m in models] == ["fp32", "bf16"] and names_of(paths, models) == ["mvitac", "mvitac"]
 
 
 def test_runs_are_told_apart_by_the_end_of_their_path() -> None:

@@ -37,10 +37,11 @@ def names_of(paths: Sequence[Path], models: Sequence[Model]) -> list[str]:
 
 
 def _settings(path: Path, model: Model) -> str:
-    """Digest of all settings but the seed, and of the data by content. Runs that share it are seeds of one method."""
-    record = load_run(path)[1] if (path / "run.json").exists() else {}
+    """Digest of all settings that were asked for but the seed, and of the data by content. Runs that share it are seeds of one method."""
+    asked, record = load_run(path) if (path / "run.json").exists() else (model.run, {})
     data = record.get("pack") or to_json(model.run.data)
-    return digest([replace(model.run, seed=0, data=PackConfig()).digest(), data])
+    # The precision that was asked for: `auto` may mean another one for each seed.
+    return digest([replace(model.run, seed=0, data=PackConfig(), precision=asked.precision).digest(), data])
 
 
 def _places(groups: Sequence[Sequence[Path]]) -> list[str]:

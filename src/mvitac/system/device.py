@@ -50,6 +50,9 @@ def has_bf16(device: torch.device) -> bool:
     return any(ask is not None and ask() for ask in chip) and library is not None and library()
 
 
+WORTH = 0.9  # auto takes bf16 below this part of fp32's time: nearer to 1, noise would choose, anew for each seed
+
+
 @dataclass(frozen=True)
 class Hardware:
     """The device of a run, the precision of its networks, and a sentence about it."""
@@ -63,7 +66,7 @@ class Hardware:
     def choose(cls, device: torch.device, asked: str, work: Callable[[], object] | None = None) -> "Hardware":
         """What ``Run.precision`` means on ``device``: auto is bf16 where the hardware computes it, else fp32.
 
-        On a CPU that computes it, ``work`` (one pass of the run's networks) is timed in both, and the faster one is taken.
+        On a CPU that computes it, ``work`` (one pass of the run's networks) is timed in both: bf16 must be faster by a tenth.
         """
         kind, own = {"cpu": "CPU", "cuda": "GPU"}.get(device.type, "device"), has_bf16(device)
         if asked != "auto":
@@ -74,7 +77,7 @@ class Hardware:
         if device.type != "cpu" or not work:
             return cls(device, "bf16", "precision: bf16 (auto)")
         slower = slowdown(device, work)
-        precision = "bf16" if slower < 1 else "fp32"
+        precision = "bf16" if slower < WORTH else "fp32"
         return cls(device, precision, f"precision: {precision} (auto: bf16 takes {slower:.2f} of fp32's time)", slower)
 
 
