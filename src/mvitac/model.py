@@ -330,6 +330,13 @@ class Model(nn.Module):
         tensors = {name: t.cpu().contiguous() for name, t in self.state_dict().items()}
         return digest([safetensors_digest(tensors), *dict.fromkeys(self.sides(m)[0] for m in self.encoders)])
 
+    def features_key(self, modality: str) -> str:
+        """Content address of what the features of ``modality`` depend on. Models that share a tower share it."""
+        tensors = {name: t.cpu().contiguous() for name, t in self.encoders[modality].state_dict().items()}
+        encoder = self.run.encoder[modality]
+        kind = encoder.trunk, encoder.temporal, self.levels(modality), self.sides(modality)[0], self.stored
+        return digest([safetensors_digest(tensors), *kind])
+
     def save(self, path: Path) -> None:
         """Write a .safetensors file with the run and the description of the data in its header."""
         tensors = {name: t.cpu().contiguous() for name, t in self.state_dict().items()}

@@ -183,11 +183,12 @@ class Run:
             raise ValueError("bf16 is not supported on mps: use --precision fp32")
 
     def _check_encoder(self, modality: str, spec: DataSpec, stored_size: int) -> None:
-        encoder, size, whole = self.encoder[modality], self.augment.size_of(modality), self.augment.whole_of(modality)
-        if max(size, whole) > stored_size:
+        encoder, size = self.encoder[modality], self.augment.size_of(modality)
+        # Whole images may be enlarged: a network that learned on large ones sees more in them (docs/training.md).
+        if size > stored_size and not self.augment.of(modality).fixed:
             raise ValueError(
-                f"{modality} of {max(size, whole)} px cannot be cut from images stored at {stored_size} px:"
-                f" give --augment.size {stored_size} or less, --augment.whole likewise, or pack at a larger --data.size"
+                f"{modality} of {size} px cannot be cut from images stored at {stored_size} px:"
+                f" give --augment.size {stored_size} or less, or pack at a larger --data.size"
             )
         if encoder.temporal != "stack" and spec.window.frames == 1:
             raise ValueError(

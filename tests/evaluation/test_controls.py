@@ -14,9 +14,11 @@ from mvitac.data.spec import DataSpec
 from mvitac.evaluation.classifiers import fit_knn, fit_linear
 from mvitac.evaluation.controls import borders, controls_of, frozen_trunks, imagenet_trunk, starts_of, thumbnails
 from mvitac.methods.supervised import SupervisedConfig
+from mvitac.model_files import fresh
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders
 from mvitac.recipes import recipe, with_method
 from mvitac.run import Run
+from mvitac.transforms.random_views import ViewAugment
 from support.toy import Toy, toy_pack
 
 
@@ -45,14 +47,26 @@ def test_the_border_sees_nothing_of_the_middle() -> None:
 def test_frozen_trunks_are_imagenet_and_files_that_runs_started_from() -> None:
     run = replace(recipe("smoke"), encoder=Encoders.both(trunk="mvitac_tiny", weights=SCRATCH))
     started = replace(run, encoder=run.encoder.changed(weights="b.pth"))
-    found = frozen_trunks([run, started, started], 72)
+    found = frozen_trunks([run, started, started])
     assert [name for name, _ in found] == ["imagenet", "start"] and found[1][1].encoder == started.encoder
     large = replace(started, augment=replace(run.augment, whole=48))
-    assert frozen_trunks([run, large], 72)[1][1].augment.whole_of("touch") == 48  # as that run saw them
-    (_, control), *rest = frozen_trunks([run], 500)
+    assert frozen_trunks([run, large])[1][1].augment.whole_of("touch") == 48  # as that run saw them
+    (_, control), *rest = frozen_trunks([run])
     assert not rest and {control.encoder[m].trunk for m in ("vision", "touch")} == {"tf_efficientnet_lite0"}
-    assert {control.augment.whole_of(m) for m in ("vision", "touch")} == {128}  # as stored, up to here
-    assert frozen_trunks([run], 72)[0][1].augment.whole_of("touch") == 72
+    assert {control.augment.whole_of(m) for m in ("vision", "touch")} == {128}
+
+
+def test_the_features_of_a_locked_tower_are_kept_once_for_the_run_and_its_control() -> None:
+    base = recipe("smoke")
+    locked = EncoderConfig(trunk="tf_efficientnet_lite0", locked=True)
+    fixed = ViewAugment(scale=(1.0, 1.0), flip=0.0, grayscale=0.0, size=128)
+    run = replace(
+        base, encoder=replace(base.encoder, vision=locked), augment=replace(base.augment, size=32, vision=fixed)
+    )
+    spec = Toy(4).spec()
+    model, control = (fresh(each, spec, 40) for each in (run, frozen_trunks([run])[0][1]))
+    keys = {m: {each.features_key(m) for each in (model, control)} for m in ("vision", "touch")}
+    assert len(keys["vision"]) == 1 and len(keys["touch"]) == 2
 
 
 def test_the_runs_own_trunk_is_the_imagenet_control_where_its_weights_are(monkeypatch: pytest.MonkeyPatch) -> None:

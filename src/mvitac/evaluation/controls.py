@@ -37,7 +37,7 @@ from mvitac.system.threads import in_threads
 CONTROLS = ("imagenet", "start", "untrained", "pixels", "border", "majority", "mean")
 """Names of the controls in the order of a table. The dataset's own controls come before the last two, of which a task has
 one: the most common class, or the mean value."""
-IMAGENET_SIDE = 128  # px: the control sees stored images up to this side, though the runs may see smaller ones
+IMAGENET_SIDE = 128  # px: the control sees images of this side, enlarged if need be, though the runs may see smaller ones
 Records = list[dict[str, Any]]
 
 
@@ -70,7 +70,7 @@ def controls_of(
     on, where that is not ``pack``. ``standardise``: as for the runs (``sensors.touch_features``), for the trunks.
     """
     records = label_controls(pack, tasks)
-    starts, weights = starts_of(runs, specs or [pack.spec] * len(runs)), frozen_trunks(runs, pack.size)
+    starts, weights = starts_of(runs, specs or [pack.spec] * len(runs)), frozen_trunks(runs)
     fitted = sum(len(probes_of(task, probes)) for task in tasks) * (len(starts) + len(weights))
     num = len(modalities) * (len(tasks) + fitted) + len(tasks) * ("touch" in modalities)
 
@@ -158,11 +158,11 @@ def starts_of(runs: Sequence[Run], specs: Sequence[DataSpec]) -> list[tuple[Run,
     return found
 
 
-def frozen_trunks(runs: Sequence[Run], stored: int) -> list[tuple[str, Run]]:
+def frozen_trunks(runs: Sequence[Run]) -> list[tuple[str, Run]]:
     """The pre-trained trunks to probe as they are, by name: ImageNet's, and files that ``runs`` started from.
 
     ImageNet is left out where no weights are installed or cached (``imagenet.source``). It sees images as large as the
-    runs do, or as they are ``stored`` [px], up to ``IMAGENET_SIDE``. Other people's encoders alone have no such row.
+    runs do, and at least ``IMAGENET_SIDE``. Other people's encoders alone have no such row.
     """
     # The heads of SimCLR are not read; it takes any trunk and modality.
     runs = [replace(run, method=SimCLRConfig()) for run in runs]
@@ -171,7 +171,7 @@ def frozen_trunks(runs: Sequence[Run], stored: int) -> list[tuple[str, Run]]:
     trunks = {m: imagenet_trunk(run.encoder[m]) for run in runs[:1] for m in MODALITIES}
     if runs and (vision := trunks["vision"]) and (touch := trunks["touch"]):
         views = runs[0].augment
-        sides = {m: max(views.whole_of(m), min(stored, IMAGENET_SIDE)) for m in MODALITIES}
+        sides = {m: max(views.whole_of(m), IMAGENET_SIDE) for m in MODALITIES}
         views = replace(views, **{m: replace(views.of(m), whole=side) for m, side in sides.items()})
         found.append(("imagenet", replace(runs[0], encoder=Encoders(vision=vision, touch=touch), augment=views)))
     return found[::-1]

@@ -275,7 +275,7 @@ def check_unseen(
 
 def _check_weights(runs: Sequence[Run], pack: Pack, session: ProbeConfig) -> None:
     """Load the weights of the controls once, so that missing ones are found before any probe is fitted."""
-    for _, run in frozen_trunks(runs, pack.size) if session.controls else ():
+    for _, run in frozen_trunks(runs) if session.controls else ():
         for config in {run.encoder.vision, run.encoder.touch}:
             build_trunk(config, 3)
 

@@ -52,8 +52,8 @@ def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_h
 
 def _place(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool) -> Path:
     """The file of these features in the cache."""
-    whole, heads = model.sides(modality)  # the weights' digest covers the first
+    whole, heads = model.sides(modality)  # the key covers the first
     kind = [heads] if for_heads and heads != whole else []
     device = next(model.parameters()).device.type
-    key = digest([model.weights_digest(), pack.digest, modality, digest(rows.tolist()), device, *kind])
+    key = digest([model.features_key(modality), pack.digest, modality, digest(rows.tolist()), device, *kind])
     return cache_dir() / "features" / f"{key[:32]}.npy"

@@ -164,7 +164,7 @@ def _controls(work: Work, out: Path, session: ProbeConfig) -> tuple[Records, Rec
     if not session.controls:
         return [], []
     runs = [job.run for job in work.jobs if job.label == work.plan.reference] or [work.jobs[0].run]
-    frozen = [name for name, _ in frozen_trunks(runs, work.pack.size)]  # weights may be installed later
+    frozen = [name for name, _ in frozen_trunks(runs)]  # weights may be installed later
     key = digest([to_json(session), work.pack.digest, to_json(work.pack.spec), [run.digest() for run in runs], frozen])
     path = out / "controls.json"
     if path.exists() and (kept := read_json(path, "the controls"))["key"] == key:

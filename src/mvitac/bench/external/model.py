@@ -136,6 +136,9 @@ class ExternalModel(Model):
             raise ValueError(f"{self.text} gives NaN or infinite features of {modality}: check weights, mean and std")
         return found
 
+    def features_key(self, modality: str) -> str:
+        return self.weights_digest()
+
     def describe(self) -> dict[str, Any]:
         """What is needed to repeat and to judge the scores, JSON-ready."""
         return {
