@@ -66,7 +66,7 @@ class Hardware:
     def choose(cls, device: torch.device, asked: str, work: Callable[[], object] | None = None) -> "Hardware":
         """What ``Run.precision`` means on ``device``: auto is bf16 where the hardware computes it, else fp32.
 
-        On a CPU that computes it, ``work`` (one pass of the run's networks) is timed in both: bf16 must be faster by a tenth.
+        On a CPU that computes it, ``work`` (one pass of its networks) is timed in both: bf16 must be faster by a tenth.
         """
         kind, own = {"cpu": "CPU", "cuda": "GPU"}.get(device.type, "device"), has_bf16(device)
         if asked != "auto":
