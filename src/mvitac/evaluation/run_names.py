@@ -37,7 +37,7 @@ def names_of(paths: Sequence[Path], models: Sequence[Model]) -> list[str]:
 
 
 def _settings(path: Path, model: Model) -> str:
-    """Digest of the settings that were asked for, but the seed, and of the data. Runs that share it are seeds of one method."""
+    """Digest of the settings that were asked for but the seed, and the data. Runs that share it are seeds of one."""
     asked, record = load_run(path) if (path / "run.json").exists() else (model.run, {})
     data = record.get("pack") or to_json(model.run.data)
     # The precision that was asked for: `auto` may mean another one for each seed.
