@@ -16,8 +16,8 @@ from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Target, Task, ValueTask
 from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.registry import check_range, to_json, unknown
-from mvitac.sim import grasps, materials
-from mvitac.sim.sensors import SENSORS, Sensor, random_sensors
+from mvitac.sim import grasps, materials, measured
+from mvitac.sim.sensors import NAMED, SENSORS, Sensor, random_sensors
 
 LICENCE = "Apache-2.0 (made by this package)"
 CONTACT = {"depth": ["depth_mm"], "position": ["contact_x_mm", "contact_y_mm"], "patch": ["patch_mm2"]}
@@ -69,9 +69,9 @@ class MaterialsConfig(SimulatedConfig):
     difference: Annotated[bool, tyro.conf.arg(name="subtract-background")] = False
     """Store (touch - background) / 2 + 128, with the background of the same sensor; no contact is mid-gray."""
     makes: tuple[str, ...] = ()
-    """Names of the sensors to press with (mvitac.sim.sensors). Default: all that are not held out."""
+    """Sensors to press with (mvitac.sim.sensors; gelsight, gelsight_mini: real gels). Default: all not held out."""
     sensors: int = 0
-    """Press with this many sensors drawn at random instead (palette, LED directions, dots, response). 0 = known makes."""
+    """Press with this many sensors drawn at random (palette, LED directions, dots, response), and with --makes if given."""
     sensors_per_press: int = 1
     """Rows per touch: the same spot pressed with so many different sensors (for lambda_sensor)."""
 
@@ -80,18 +80,17 @@ class MaterialsConfig(SimulatedConfig):
         check_range(self, 1, math.inf, "touches")
         check_range(self, 0, 10_000, "sensors")
         for name in self.makes:
-            if name not in SENSORS:
-                raise unknown("sensor", name, SENSORS)
-        if bool(self.makes) + bool(self.sensors) + self.held_out_sensor > 1:
-            raise ValueError("makes, sensors and held_out_sensor each say which sensors press: give one of them")
+            if name not in NAMED:
+                raise unknown("sensor", name, NAMED)
+        if self.held_out_sensor and (self.makes or self.sensors):
+            raise ValueError("held_out_sensor presses with that sensor alone: leave out makes and sensors")
         check_range(self, 1, len(self.choice()), "sensors_per_press")
 
     def choice(self) -> tuple[Sensor, ...]:
         """The sensors that a touch chooses from."""
-        if self.sensors:
-            return random_sensors(self.seed, self.sensors)
-        named = self.makes or [s.name for s in SENSORS.values() if s.held_out == self.held_out_sensor]
-        return tuple(SENSORS[name] for name in named)
+        if self.sensors or self.makes:
+            return (*random_sensors(self.seed, self.sensors), *(NAMED[name] for name in self.makes))
+        return tuple(s for s in SENSORS.values() if s.held_out == self.held_out_sensor)
 
     def on_new_sensor(self) -> "MaterialsConfig | None":
         if self.held_out_sensor:
@@ -101,6 +100,9 @@ class MaterialsConfig(SimulatedConfig):
         return replace(self, **once, makes=(), sensors=0, held_out_sensor=True)
 
     def source(self) -> Source:
+        for sensor in self.choice():
+            if sensor.calibration:
+                measured.folder(sensor.calibration)  # an error here, and not in each worker
         return Materials(self)
 
 

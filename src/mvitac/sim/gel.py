@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, uniform_filter
 
+from mvitac.sim import measured
 from mvitac.sim.sensors import SENSORS, Pair, Sensor
 
 __all__ = ["GEL_STIFFNESS", "SENSORS", "Sensor", "area_resize", "contact", "press", "pressure", "relax", "render"]
@@ -139,7 +140,8 @@ def render(
     # A copy has the same properties at every size.
     copy, paint = np.random.default_rng([_TAG, *sensor.name.encode(), unit]).spawn(2)
     imprint = imprint_mm.astype(np.float32)
-    picture = _illuminate(imprint, sensor, copy, paint, pixel_mm, gain)
+    light = _measured if sensor.calibration else _illuminate
+    picture = light(imprint, sensor, copy, paint, pixel_mm, gain)
     if sensor.marker_pitch_mm:
         _draw_markers(picture, imprint, sensor, copy, pixel_mm, shear_mm)
     _soil(picture, sensor, copy, pixel_mm)
@@ -185,6 +187,16 @@ def _illuminate(
             change -= _shadow(imprint, (-rx, -ry), pixel_mm) * (rest * sensor.shadow).astype(np.float32)
         picture[..., c] = rest + change
     return picture
+
+
+def _measured(
+    imprint: F, sensor: Sensor, copy: np.random.Generator, paint: np.random.Generator, pixel_mm: float, gain: float
+) -> F:
+    """Return float levels [H, W, 3] of a real gel. A copy has its own LED balance and field of view on that gel."""
+    gy, gx = np.gradient(imprint, np.float32(pixel_mm))
+    balance = copy.normal(1.0, 0.05, 3) * copy.normal(1.0, 0.04)
+    picture = measured.read(sensor.calibration).light(gx, gy, pixel_mm, copy.uniform(-1, 1, 2), gain)
+    return picture * balance.astype(np.float32)
 
 
 def _shadow(imprint: F, towards: Pair, pixel_mm: float) -> F:

@@ -1,4 +1,4 @@
-"""Models of tactile sensors: colours, LED directions, printed dots, dirt and lens edge."""
+"""Models of tactile sensors: colours, LED directions, printed dots, dirt and lens edge; set by eye, measured or random."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
@@ -16,11 +16,13 @@ class Sensor:
     """Appearance of one type of tactile sensor. Colours are 8-bit levels; u, v are -1 to 1 over the picture."""
 
     name: str
-    base: RGB  # level far from the glow, per channel
-    glow: tuple[tuple[float, float, float, float, float], ...]
+    calibration: str = ""
+    """A real gel (``measured.read``) in place of base, glow, tilt, response, saturation and shadow."""
+    base: RGB = (0.0, 0.0, 0.0)  # level far from the glow, per channel
+    glow: tuple[tuple[float, float, float, float, float], ...] = ()
     """Per channel (height in levels, centre u, centre v, width u, width v) of the soft bright spot of its LEDs."""
-    tilt: tuple[Pair, Pair, Pair]  # linear change of level along (u, v), per channel
-    response: tuple[Pair, Pair, Pair]
+    tilt: tuple[Pair, ...] = ()  # linear change of level along (u, v), per channel
+    response: tuple[Pair, ...] = ()
     """Change of level per unit slope along (x, y), per channel: the direction of its LED."""
     saturation: float = 75.0  # change of level at which the response saturates
     shadow: float = 0.35  # fraction of light that a ridge takes from the surface behind it, seen from the LED
@@ -116,6 +118,15 @@ SENSORS: dict[str, Sensor] = {
         ),
     )
 }
+
+MEASURED: dict[str, Sensor] = {
+    # The real frame has the dirt and the edge of its gel. Noise is that of two frames, averaged to 72 x 72 pixels.
+    name: Sensor(name=name, calibration=name, dirt=0.0, scratches=0.0, noise=noise)
+    for name, noise in (("gelsight", 0.6), ("gelsight_mini", 0.5))
+}
+"""Two real gels. They press only where they are named, so they change no other data."""
+
+NAMED = SENSORS | MEASURED
 
 MARGIN = 0.25  # how far a random sensor may lie outside the four known ones: this part of their range, on either side
 _TAG = 0x5E5
