@@ -130,6 +130,7 @@ EVEN = [99.8 + k / 10 for k in range(6)]  # frames 9 to 14
 def test_live_shows_this_frame_and_earlier_ones_of_the_touch() -> None:
     assert play(Seeing(), EVEN) == [[9, 9, 9], [10, 9, 9], [11, 10, 9], [12, 11, 10], [13, 12, 11], [14, 13, 12]]
     assert play(Seeing(frames=2, stride=2), EVEN)[-1] == [14, 12]
+    assert play(Seeing(frames=2, stride=0.3, order="time"), EVEN)[-1] == [14, 11]  # in seconds
 
 
 def test_dropped_frames_do_not_shift_a_window() -> None:
@@ -138,10 +139,6 @@ def test_dropped_frames_do_not_shift_a_window() -> None:
     assert play(Seeing(), gap) == [[9, 9, 9], [10, 9, 9], [11, 10, 10], [12, 11, 10], [13, 12, 11]]
     jitter = [t + d for t, d in zip(EVEN, (0, 0.01, -0.01, 0.01, -0.01, 0.01), strict=True)]
     assert play(Seeing(), jitter) == play(Seeing(), EVEN)
-
-
-def test_the_stride_may_be_in_seconds() -> None:
-    assert play(Seeing(frames=2, stride=0.3, order="time"), EVEN)[-1] == [14, 11]
 
 
 def test_the_background_stands_for_the_first_frame() -> None:

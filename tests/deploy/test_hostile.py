@@ -7,10 +7,11 @@ trap, a folder that only the artifact names, and none may be on the network.
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +26,8 @@ from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.deploy.card import _harmless
 from mvitac.deploy.engine import Engine
-from mvitac.deploy.publish import publish
 from mvitac.evaluation.run_names import names_of
-from mvitac.nn.encoders import Encoders, build_trunk
-from mvitac.nn.imagenet import load
 from mvitac.system.files import digest, digest_file, read_json, write_json
-from support.training_runs import smoke
 
 _touched: list[str] | None = None
 
@@ -40,24 +37,37 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
         _touched.append(f"{event} {arguments}")
 
 
-@pytest.fixture
-def touched(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """What Python opens, lists, deletes, starts and connects to during the test."""
+@contextmanager
+def untouched(trap: Path) -> Iterator[None]:
+    """Meanwhile nothing in the trap is opened, listed or deleted, nothing is sent and nothing started."""
     global _touched
     if not hasattr(sys, "_mvitac_hook"):
         sys.addaudithook(_hook)  # cannot be removed again
         sys._mvitac_hook = True  # type: ignore[attr-defined]
-    _touched = []
-    yield _touched
-    _touched = None
+    _touched = seen = []
+    try:
+        yield
+    finally:
+        _touched = None
+    for one in seen:
+        assert f"{trap}" not in one and "/trap" not in one, one
+        assert not one.startswith(("socket.connect", "socket.getaddrinfo", "subprocess", "os.system")), one
+    assert (trap / "process-1" / "letter.txt").read_text() == "dear"
 
 
 Change = Callable[[Path, dict[str, Any]], object]
-"""Changes the run in the header of model.safetensors, given the trap and the run."""
+"""Changes the run in the header of model.safetensors, or a description, given the trap and what is changed."""
 
 
 def forge(
-    folder: Path, trap: Path, *, run: Change | None = None, about: Change | None = None, stored: int | None = None
+    folder: Path,
+    trap: Path,
+    *,
+    run: Change | None = None,
+    stored: int | None = None,
+    about: Change | None = None,
+    probes: dict[str, torch.Tensor] | None = None,
+    files: dict[str, bytes] | None = None,
 ) -> None:
     """Change the artifact or export in ``folder``, and make every digest fit again."""
     file = folder / "model.safetensors"
@@ -69,6 +79,11 @@ def forge(
         header |= {"run": json.dumps(value), "stored": str(stored or header["stored"])}
         header["header_digest"] = digest([header["run"], header["spec"], header["stored"]])
         safetensors.torch.save_file(safetensors.torch.load_file(file), file, header)
+    if probes:
+        kept = folder / "probes.safetensors"
+        safetensors.torch.save_file({**safetensors.torch.load_file(kept), **probes}, kept)
+    for name, content in (files or {}).items():
+        (folder / name).write_bytes(content)
     (described,) = (folder / name for name in ("artifact.json", "export.json") if (folder / name).exists())
     value = read_json(described, "a description")
     value["files"] = {name: digest_file(folder / name) for name in value["files"] if (folder / name).is_file()}
@@ -113,33 +128,16 @@ def trap(tmp_path: Path) -> Path:
     return folder
 
 
-def check(touched: list[str], trap: Path) -> None:
-    """Nothing in the trap was touched, nothing was sent, nothing was deleted."""
-    for one in touched:
-        assert f"{trap}" not in one and "/trap" not in one, one
-        assert not one.startswith(("socket.connect", "socket.getaddrinfo", "subprocess", "os.system")), one
-    assert (trap / "process-1" / "letter.txt").read_text() == "dear"
-
-
 @pytest.mark.parametrize(("command", "change"), PLACES)
 def test_the_place_of_its_data_is_not_opened(
-    copy: Path,
-    trap: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    touched: list[str],
-    command: str,
-    change: Change,
+    copy: Path, trap: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, change: Change
 ) -> None:
     forge(copy, trap, run=change)
-    touched.clear()
     words = [w.format(artifact=copy, out=tmp_path / "out") for w in COMMANDS[command]]
-    assert main(words) == 2
-    seen = list(touched)
+    with untouched(trap):
+        assert main(words) == 2
     error = capsys.readouterr().err.splitlines()[-1]
-    assert "stranger" in error and "--on PACK" in error
-    check(seen, trap)
-    assert not (tmp_path / "out").exists()
+    assert "stranger" in error and "--on PACK" in error and not (tmp_path / "out").exists()
 
 
 def encoder(**fields: str) -> Change:
@@ -150,14 +148,25 @@ def encoder(**fields: str) -> Change:
     return change
 
 
-@pytest.mark.parametrize("weights", ["{trap}/letter.pth", "imagenet"])
+@pytest.mark.parametrize(
+    ("weights", "command"),
+    [
+        ("imagenet", ["probe", "--tasks", "bright", "--modalities", "touch"]),
+        ("{trap}/letter.pth", ["probe", "--tasks", "bright", "--modalities", "touch"]),
+        ("{trap}/letter.pth", ["publish", "{out}"]),
+    ],
+)
 def test_initial_weights_are_neither_opened_nor_fetched(
-    copy: Path, trap: Path, pack: Pack, touched: list[str], weights: str
+    copy: Path, trap: Path, tmp_path: Path, pack: Pack, weights: str, command: list[str]
 ) -> None:
+    """Nor for the controls, which are then of random weights."""
+    (trap / "letter.pth").write_text("dear")
     forge(copy, trap, run=encoder(weights=weights))
-    touched.clear()
-    assert main(["probe", str(copy), "--on", str(pack.path), "--tasks", "bright", "--modalities", "touch"]) == 0
-    check(list(touched), trap)
+    name, *options = (word.format(out=tmp_path / "out") for word in command)
+    with untouched(trap):
+        assert main([name, str(copy), *options, "--on", str(pack.path)]) == 0
+    if name == "publish":
+        assert "| untrained |" in (tmp_path / "out" / "README.md").read_text()
 
 
 def test_start_weights_of_another_run_are_not_opened(copy: Path, trap: Path) -> None:
@@ -185,80 +194,112 @@ def setting(*keys: str | int, value: Any) -> Change:
     return change
 
 
+class Payload:
+    """Unpickling this ends the test."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return sys.exit, ("unpickled",)
+
+
 def above(trap: Path, whole: dict[str, Any]) -> None:
     whole["files"]["../trap/pairs.csv"] = "0"
 
 
+MODEL, PROBES = "model.safetensors", "probes.safetensors"
+WEIGHT, BIAS = "pattern.touch.weight", "pattern.touch.bias"
 NO_SPREAD = {"name": "n", "unit": "N", "edges": [], "spread": []}
 LARGE = 10**9  # every image would be resized to it
-SIZE = {"stored": LARGE, "about": setting("preprocessing", "stored", value=LARGE)}
-RUNS: dict[str, tuple[Change, str]] = {
-    "trunk from the Hub": (encoder(trunk="hf-hub:stranger/model"), "unknown trunk"),
-    "trunk from a folder": (encoder(trunk="local-dir:{trap}"), "unknown trunk"),
-    "another trunk": (encoder(trunk="resnet18"), "holds other weights"),
-    "unknown dataset": (setting("data", value={"name": "evil"}), "unknown dataset 'evil'"),
-    "a field that is none": (setting("exec", value="rm"), "unknown field in run 'exec'"),
-    "a list for a number": (setting("steps", value=[1]), "steps"),
+OTHER = "its model was trained with"
+ARTIFACTS: dict[str, tuple[dict[str, Any], str]] = {
+    "a pickle": ({"files": {MODEL: pickle.dumps(Payload())}}, "cannot be read as safetensors"),
+    "a pickle of probes": ({"files": {PROBES: pickle.dumps(Payload())}}, "cannot be read as safetensors"),
+    "a huge header": ({"files": {MODEL: (1 << 40).to_bytes(8, "little") + b"{"}}, "cannot be read as safetensors"),
+    "size": (
+        {"stored": LARGE, "about": setting("preprocessing", "stored", value=LARGE)},
+        "stored 1000000000: expected 1 to 1024 px",
+    ),
+    "trunk from the Hub": ({"run": encoder(trunk="hf-hub:stranger/model")}, "unknown trunk"),
+    "trunk from a folder": ({"run": encoder(trunk="local-dir:{trap}")}, "unknown trunk"),
+    "unknown dataset": ({"run": setting("data", value={"name": "evil"})}, "unknown dataset 'evil'"),
+    "a field that is none": ({"run": setting("exec", value="rm")}, "unknown field in run 'exec'"),
+    "a list for a number": ({"run": setting("steps", value=[1])}, "steps"),
+    "file above": ({"about": above}, "names others than"),
+    "files are a list": ({"about": setting("files", value=[MODEL])}, "lacks files"),
+    "without model": ({"about": lambda trap, about: about["files"].pop(MODEL)}, "lacks files"),
+    "version": ({"about": setting("format_version", value=99)}, "is not mvitac-artifact"),
+    "no preprocessing": ({"about": setting("preprocessing", value=3)}, "is damaged"),
+    "normalisation": ({"about": setting("preprocessing", "mean", value=[0.5] * 3)}, f"mean is .*, {OTHER}"),
+    "colours": ({"about": setting("preprocessing", "colour_order", value="BGR")}, f"colour_order is BGR, {OTHER}"),
+    "side": ({"about": setting("preprocessing", "size", value=31)}, f"size is 31, {OTHER}"),
+    "probe of sound": ({"about": setting("probes", 0, "modality", value="sound")}, "is damaged"),
+    "one class more": ({"about": setting("probes", 0, "classes", value=["x"] * 4)}, "do not fit"),
+    "wide probe": ({"probes": {WEIGHT: torch.zeros(3, 9)}}, "reads 9 features"),
+    "a number for a probe": ({"probes": {WEIGHT: torch.tensor(1.0)}}, r"weights of shape \(\)"),
+    "short bias": ({"probes": {BIAS: torch.zeros(2)}}, "do not fit 3 classes"),
+    "no numbers": ({"probes": {WEIGHT: torch.full((3, 64), torch.nan)}}, "not all finite"),
 }
-ARTIFACTS: dict[str, tuple[Change, str]] = {
-    "file above": (above, "names others than"),
-    "files are a list": (setting("files", value=["model.safetensors"]), "lacks files"),
-    "without model": (lambda trap, about: about["files"].pop("model.safetensors"), "lacks files"),
-    "version": (setting("format_version", value=99), "is not mvitac-artifact"),
-    "no preprocessing": (setting("preprocessing", value=3), "is damaged"),
-    "probe of sound": (setting("probes", 0, "modality", value="sound"), "is damaged"),
-    "one class more": (setting("probes", 0, "classes", value=["x"] * 4), "do not fit"),
+EXPORTS: dict[str, tuple[dict[str, Any], str]] = {
+    name: ({"about": change}, says)
+    for name, (change, says) in {
+        "file above": (above, "names others than"),
+        "no tolerance": (lambda trap, about: about.pop("tolerance"), "is damaged"),
+        "a number for a class": (setting("classes", value={"pattern": [1]}), "expected str, got 1"),
+        "a value without unit": (setting("values", value={"force": [{"name": "n"}]}), "field 'unit' is missing"),
+        "no spread": (setting("values", value={"force": [NO_SPREAD]}), "0 edges and 0 spreads: give n ascending"),
+        "a number for outputs": (setting("outputs", value=1e308), "is damaged"),
+        "no inputs": (setting("inputs", value={}), "cannot be run"),
+    }.items()
 }
-EXPORTS: dict[str, tuple[Change, str]] = {
-    "file above": (above, "names others than"),
-    "no tolerance": (lambda trap, about: about.pop("tolerance"), "is damaged"),
-    "a number for a class": (setting("classes", value={"pattern": [1]}), "expected str, got 1"),
-    "a value without unit": (setting("values", value={"force": [{"name": "n"}]}), "field 'unit' is missing"),
-    "no spread": (setting("values", value={"force": [NO_SPREAD]}), "0 edges and 0 spreads: give n ascending"),
-    "a number for outputs": (setting("outputs", value=1e308), "is damaged"),
-    "no inputs": (setting("inputs", value={}), "cannot be run"),
-}
-FORGED = [("artifact", SIZE, "stored 1000000000: expected 1 to 1024 px")]
-FORGED += [("artifact", {"run": change}, says) for change, says in RUNS.values()]
-FORGED += [("artifact", {"about": change}, says) for change, says in ARTIFACTS.values()]
-FORGED += [("onnx", {"about": change}, says) for change, says in EXPORTS.values()]
+FORGED = [("artifact", *each) for each in ARTIFACTS.values()] + [("onnx", *each) for each in EXPORTS.values()]
 
 
-@pytest.mark.parametrize(("kind", "changes", "says"), FORGED, ids=["size", *RUNS, *ARTIFACTS, *EXPORTS])
-def test_a_run_or_a_description_that_is_none_is_refused(
-    request: pytest.FixtureRequest,
-    trap: Path,
-    tmp_path: Path,
-    touched: list[str],
-    kind: str,
-    changes: dict[str, Any],
-    says: str,
+def opened(folder: Path) -> None:
+    mvitac.load(folder) if (folder / "artifact.json").exists() else Engine(folder)
+
+
+@pytest.mark.parametrize(("kind", "changes", "says"), FORGED, ids=[*ARTIFACTS, *EXPORTS])
+def test_what_is_forged_is_refused(
+    request: pytest.FixtureRequest, trap: Path, tmp_path: Path, kind: str, changes: dict[str, Any], says: str
 ) -> None:
+    """Although every digest is in order."""
     folder = shutil.copytree(request.getfixturevalue(kind), tmp_path / kind)
     forge(folder, trap, **changes)
-    touched.clear()
-    with pytest.raises(ValueError, match=says):
-        mvitac.load(folder) if kind == "artifact" else Engine(folder)
-    check(list(touched), trap)
+    with untouched(trap), pytest.raises(ValueError, match=says):
+        opened(folder)
 
 
-@pytest.mark.parametrize("weights", ["imagenet", "{trap}/trunk.pth"])
-def test_weights_that_an_artifact_names_are_not_opened(
-    pack: Pack, trap: Path, tmp_path: Path, touched: list[str], monkeypatch: pytest.MonkeyPatch, weights: str
+def test_a_network_larger_than_the_machine_is_refused_before_it_is_made(
+    copy: Path, trap: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a trunk that timm has weights for. The artifact's controls are of random weights."""
-    scratch = Encoders.both(trunk="test_resnet.r160_in1k", weights="scratch")
-    torch.save(build_trunk(scratch.touch, 3).state_dict(), trap / "trunk.pth")
-    mvitac.train(replace(smoke(pack, steps=1, eval_every=0), encoder=scratch), tmp_path / "run", quiet=True)
-    made = publish(tmp_path / "run", tmp_path / "made", pack)
-    forge(made, trap, run=encoder(weights=weights))
-    asked: list[str] = []
-    monkeypatch.setattr("mvitac.nn.imagenet.load", lambda trunk, kwargs: asked.append(trunk) or load(trunk, kwargs))
-    touched.clear()
-    publish(made, tmp_path / "again", pack, allow_leak=True)
-    check(list(touched), trap)
-    assert set(asked) == {"tf_efficientnet_lite0"}  # the control, from the installed package
-    assert "| untrained |" in (tmp_path / "again" / "README.md").read_text()
+    """A header of a few kilobytes may name one."""
+    forge(copy, trap, run=encoder(trunk="resnetv2_152x4_bit"))
+    made, parameter = set(), torch.nn.Parameter.__new__
+
+    def counted(cls: type, data: torch.Tensor, requires_grad: bool = True) -> torch.nn.Parameter:
+        made.add(data.device.type)
+        return parameter(cls, data, requires_grad)
+
+    monkeypatch.setattr(torch.nn.Parameter, "__new__", counted)
+    with pytest.raises(ValueError, match="holds other weights than its run describes"):
+        mvitac.load(copy)
+    assert made == {"meta"}
+
+
+FILES = {
+    "artifact": ("model.safetensors", "probes.safetensors", "run.json", "README.md", "artifact.json"),
+    "onnx": ("model.onnx", "check.safetensors", "export.json"),
+}
+
+
+@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind, names in FILES.items() for name in names])
+def test_a_changed_byte_is_found(request: pytest.FixtureRequest, tmp_path: Path, kind: str, name: str) -> None:
+    folder = shutil.copytree(request.getfixturevalue(kind), tmp_path / kind)
+    changed = bytearray((folder / name).read_bytes())
+    place = changed.find(b"columns")  # of a description another class, or else its JSON may be none
+    changed[place if place > 0 else len(changed) // 2] ^= 1
+    (folder / name).write_bytes(changed)
+    with pytest.raises(ValueError, match="does not match its digest"):
+        opened(folder)
 
 
 def test_a_card_shows_labels_as_text() -> None:

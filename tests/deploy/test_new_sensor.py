@@ -25,9 +25,7 @@ from mvitac.deploy.publish import with_probes
 from mvitac.evaluation.probe import probe_model
 from mvitac.evaluation.sensors import (
     RecolouredPack,
-    about_new,
     learn_looks,
-    sensors_of,
     touch_features,
     unlabelled_rows,
 )
@@ -192,13 +190,6 @@ def test_what_cannot_be_shown_is_refused(model: Model, old: Pack, new: Pack, tmp
         with pytest.raises(ValueError, match=why):
             export(model, old, tmp_path / "out", config, new=pack)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_model_knows_its_sensors(model: Model, old: Pack, new: Pack) -> None:
-    assert model.spec.sensors == ("digit", "mini") and "(touch sensors digit, mini)" in repr(model)
-    assert sensors_of(new, new.rows("test")) == ("slim",) and about_new(model, old) == ""
-    assert "slim is new to the model, which knows digit, mini: nothing is done" in about_new(model, new)
-    assert about_new(model, RecolouredPack(old, new), ("colours",)).endswith("--standardise colours is used")
 
 
 def test_live_says_which_sensor_is_new(engine: Engine) -> None:

@@ -16,7 +16,7 @@ import mvitac
 from mvitac.cli.main import main
 from mvitac.data.images import fit
 from mvitac.data.pack import Pack
-from mvitac.deploy.search import Embeddings, embed, nearest
+from mvitac.deploy.search import Embeddings, nearest
 from mvitac.model import Model
 
 
@@ -116,16 +116,6 @@ def test_find_subtracts_the_background(
     assert "1.000" not in capsys.readouterr().out
 
 
-def test_the_file_holds_what_the_model_gives(artifact: Path, model: Model, pack: Pack, tmp_path: Path) -> None:
-    out = tmp_path / "x.parquet"
-    assert main(["embed", str(pack.path), "--model", str(artifact), "--out", str(out)]) == 0
-    table = pq.read_table(out)
-    assert table.column("id").to_pylist() == pack.column("id").tolist()
-    assert table.column("row").to_pylist() == list(range(pack.num))
-    expected = model.embed(touch=pack.images["touch"])["touch"].numpy()
-    np.testing.assert_allclose(np.stack(table.column("touch").to_numpy()), expected, atol=1e-4)
-
-
 def test_a_changed_file_or_another_models_is_refused(known: Path, tmp_path: Path, model: Model) -> None:
     data = bytearray(known.read_bytes())
     data[len(data) // 2] ^= 1
@@ -136,9 +126,15 @@ def test_a_changed_file_or_another_models_is_refused(known: Path, tmp_path: Path
         Embeddings(known, "0" * 64)
 
 
-def test_by_features_only_like_finds_like(pack: Pack, tmp_path: Path, model: Model) -> None:
-    embed(model, pack, tmp_path / "x.parquet")
-    known, row = Embeddings(tmp_path / "x.parquet", model.weights_digest()), int(pack.rows("test")[3])
+def test_by_features_only_like_finds_like(artifact: Path, pack: Pack, tmp_path: Path, model: Model) -> None:
+    out = tmp_path / "x.parquet"
+    assert main(["embed", str(pack.path), "--model", str(artifact), "--out", str(out)]) == 0
+    table = pq.read_table(out)
+    assert table.column("id").to_pylist() == pack.column("id").tolist()
+    assert table.column("row").to_pylist() == list(range(pack.num))
+    expected = model.embed(touch=pack.images["touch"])["touch"].numpy()
+    np.testing.assert_allclose(np.stack(table.column("touch").to_numpy()), expected, atol=1e-4)
+    known, row = Embeddings(out, model.weights_digest()), int(pack.rows("test")[3])
     assert known.find(model, pack.images["touch"][row], "touch", "touch", 1)[0].tolist() == [[row]]
     with pytest.raises(ValueError, match="touch finds no vision: embed with --shared"):
         known.find(model, pack.images["touch"][row], "touch", "vision", 1)
