@@ -1,26 +1,34 @@
-"""``mvitac live``: predict from the frames of cameras and tactile sensors; predictions are lines of JSON."""
+"""``mvitac live`` and ``predict``: answers from the frames of cameras and sensors, and from recordings."""
 
 import json
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+import pyarrow as pa
 import tyro
+from pyarrow.csv import CSVWriter
 from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, parse
+from mvitac.data.images import decode
+from mvitac.data.pack import Pack
 from mvitac.deploy.engine import EXPORT, Engine, about_sensor, frame_shapes
-from mvitac.live.cameras import source
+from mvitac.live.cameras import recording, source
 from mvitac.live.contact import LiveConfig
 from mvitac.live.predictor import Live
 from mvitac.live.recorder import Recorder
+from mvitac.live.recordings import TOGETHER, Recordings, pack_tables
 from mvitac.live.streams import CaptureThread, Stream
 from mvitac.registry import to_json
-from mvitac.system.files import cache_dir, digest, write_json
+from mvitac.system.files import cache_dir, check_place, digest, write_atomic, write_json
+from mvitac.system.progress import shown, work
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +61,10 @@ class _Options:
     """Age in seconds from which a frame is too old to be used."""
     json: Path | None = None
     """Write the summary to this file."""
+    always: bool = False
+    """Predict from every frame, in contact or not."""
+    background: tuple[Path, ...] = ()
+    """Image of the touch sensor without contact, one of each sensor, instead of the first frames."""
     live: Annotated[LiveConfig, tyro.conf.arg(name="")] = LiveConfig()
 
 
@@ -63,6 +75,7 @@ def live(argv: list[str]) -> None:
         if seconds is not None and not seconds > 0:
             raise ValueError(f"{name} {seconds:g}: give seconds, more than 0")
     check_json(options.json)
+    free = [np.array(decode(file)) for file in options.background]
     engine = _engine(options.model, options.threads)
     nearest = None
     if options.known:
@@ -79,7 +92,9 @@ def live(argv: list[str]) -> None:
     if options.record:
         channels = {m: shape[2] for m, shape in frame_shapes(engine).items()}
         recorder = Recorder(options.record, channels, sensor=sensor, tell=_say)
-    loop = Live(engine, streams, options.live, nearest=nearest, record=recorder, tell=lambda event: _say(event.text))
+    more: Any = {"nearest": nearest, "record": recorder, "tell": lambda event: _say(event.text)}
+    more |= {"free": free, "always": options.always}
+    loop = Live(engine, streams, options.live, **more)
     _run(loop, options.seconds, lambda said: print(json.dumps(said), flush=True))
     _print_summary(loop.summary())
     if options.json:
@@ -130,6 +145,75 @@ def _capture(loop: Live) -> Iterator[threading.Event]:
             thread.join(2.0)  # a device that hangs must not hang us
 
 
+@dataclass(frozen=True, kw_only=True)
+class _PredictOptions:
+    """Predict from every frame of a recording, as fast as the model computes, into a table: frame number, time, contact,
+    classes with probabilities, values with spread (docs/live.md).
+
+    A SOURCE is a video file, a folder of images[@FPS], or a pack.
+    """
+
+    model: Positional[str]
+    """Folder of an export (fastest); or of a run or an artifact, or owner/name on the Hub, which is exported first."""
+    source: Positional[str | None] = None
+    """SOURCE, where the model takes one input; or a pack."""
+    vision: str | None = None
+    """SOURCE of the camera. Frames of several recordings are matched by time."""
+    touch: tuple[str, ...] = ()
+    """SOURCE of the touch sensor, or of both of a gripper: left right."""
+    out: Path = Path("predictions.csv")
+    """The table, a row for each frame."""
+    background: tuple[Path, ...] = ()
+    """Image of the touch sensor without contact, one of each sensor, instead of the first frames."""
+    threads: int = 0
+    """CPU threads for the model; 0 = all cores."""
+    live: Annotated[LiveConfig, tyro.conf.arg(name="")] = LiveConfig()
+
+
+def predict(argv: list[str]) -> None:
+    """mvitac predict MODEL SOURCE | [--vision SOURCE] [--touch SOURCE...] [--out FILE.csv]"""
+    options = parse(_PredictOptions, argv, "predict")
+    if bool(options.source) == bool(options.vision or options.touch):
+        raise ValueError("give one SOURCE, or those of --vision and --touch")
+    check_place(options.out)
+    free = [np.array(decode(file)) for file in options.background]
+    given = {"vision": (options.vision,) if options.vision else (), "touch": options.touch}
+    engine = _engine(options.model, options.threads, tuple(m for m in given if given[m]))
+    if not (engine.classes or engine.values):
+        raise ValueError(f"{options.model} has no probes of classes or values: export it on data that has labels")
+    if options.source and (Path(options.source) / "pack.json").is_file():
+        pack = Pack(options.source)
+        _write(options.out, pack_tables(engine, pack), pack.num)
+        return
+    if options.source:
+        if len(engine.inputs) > 1:
+            raise ValueError("the model takes vision and touch: give --vision SOURCE, --touch SOURCE, or both")
+        given = dict.fromkeys(engine.inputs, (options.source,))
+    files = {m: [recording(text) for text in texts] for m, texts in given.items() if texts}
+    recordings = Recordings(engine, files, options.live, free)
+    _write(options.out, recordings.tables(), recordings.num)
+    if num := recordings.left_out:
+        _say(f"{num} frames are left out: damaged, or without a frame of the other recording within {TOGETHER} s")
+    if "touch" in files and not recordings.calibrated:
+        _say(f"contact is not known: no {options.live.calibration} frames without it, and no --background")
+
+
+def _write(out: Path, tables: Iterator[dict[str, Any]], num: int) -> None:
+    """Write ``tables`` of ``num`` rows in all as CSV, and say how fast they came."""
+    start = time.monotonic()
+
+    def write(file: Any) -> None:
+        made: list[CSVWriter] = []
+        with shown(), work("predicting", num, "frames") as advance, ExitStack() as stack:
+            for table in map(pa.table, tables):
+                made = made or [stack.enter_context(CSVWriter(file, table.schema))]
+                made[0].write_table(table)
+                advance(table.num_rows)
+
+    write_atomic(out, write)
+    _say(f"written: {out}, {num} frames, {num / (time.monotonic() - start):.0f} a second")
+
+
 def sources(
     inputs: Mapping[str, Sequence[int]], vision: str | None, touch: Sequence[str]
 ) -> dict[str, tuple[str, ...]]:
@@ -149,24 +233,25 @@ def sources(
     return given
 
 
-def _engine(model: str, threads: int) -> Engine:
-    """The engine of an export; a run or an artifact is exported first, once, into the cache."""
+def _engine(model: str, threads: int, modalities: tuple[Any, ...] = ()) -> Engine:
+    """The engine of an export; a run or an artifact is exported first, once, into the cache, with these inputs."""
+    if (Path(model) / EXPORT.name).is_file():
+        return Engine(model, threads=threads)
     from mvitac.deploy.artifact import load
-    from mvitac.deploy.export import export
+    from mvitac.deploy.export import ExportConfig, export
     from mvitac.deploy.publish import own_data, with_probes
     from mvitac.nn.weights import safetensors_digest
 
-    if (Path(model) / EXPORT.name).is_file():
-        return Engine(model, threads=threads)
     loaded = load(model)
     # Artifacts of one run differ in their probes only. A run has none: its data decides those that are fitted below.
     probes = [[to_json(r.info), safetensors_digest(dict(r.state_dict()))] for r in loaded.probes.values()]
-    key = digest([EXPORT.version, loaded.weights_digest(), probes])
+    key = digest([EXPORT.version, loaded.weights_digest(), probes, *modalities])
     folder = cache_dir() / "exports" / key[:32]
     if not folder.exists():
         _say(f"exporting {model}, once")
         pack = own_data(loaded, "`mvitac export MODEL --on PACK --out DIR` first, and give DIR")
-        export(with_probes(loaded, pack), pack, folder)
+        with shown():
+            export(with_probes(loaded, pack), pack, folder, ExportConfig(modalities=modalities))
     return Engine(folder, threads=threads)
 
 

@@ -29,6 +29,7 @@ COMMANDS = {
     "report": "evaluate:report",
     "publish": "deploy:publish",
     "export": "deploy:export",
+    "predict": "live:predict",
     "live": "live:live",
     "explore": "explore:explore",
     "embed": "search:embed",

@@ -7,15 +7,12 @@ A ``Source`` opens, reads and closes; clocks, threads and faults are in ``live/s
 import importlib.util
 import re
 from abc import ABC, abstractmethod
-from collections import deque
 from pathlib import Path
 
-import av
 import numpy as np
-from av.error import FFmpegError
 
 from mvitac.data.images import IMAGES, decode
-from mvitac.data.video import VIDEOS
+from mvitac.data.video import VIDEOS, frame_times, frames
 from mvitac.sim.sensors import SENSORS
 from mvitac.system.files import brief
 
@@ -88,53 +85,67 @@ class Camera(Source):
             self.capture.release()
 
 
-class Video(Source):
-    """A video file, at its own frame rate."""
+class Recording(Source):
+    """A recording: a source that ends, and knows the time of each of its frames."""
 
     paced = False
+    times: np.ndarray  # [N] seconds, from ``open``
+    number = -1  # of the frame that was read last, or was damaged
+
+    @property
+    def time(self) -> float:
+        """Time of the frame that was read last."""
+        return float(self.times[max(0, self.number)])
+
+    def read(self) -> np.ndarray:
+        if self.number + 1 >= len(self.times):
+            raise Ended
+        self.number += 1
+        return self.image(self.number)
+
+    @abstractmethod
+    def image(self, number: int) -> np.ndarray:
+        """Frame ``number``; they are asked for in order."""
+
+
+class Video(Recording):
+    """A video file, at its own frame rate."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def open(self) -> None:
-        try:
-            self.file = av.open(str(self.path))
-            self.fps = float(self.file.streams.video[0].average_rate or 30)
-        except (FFmpegError, IndexError) as error:
-            raise OSError(f"{self.path} cannot be read as a video ({brief(error)})") from None
-        self.frames = self.file.decode(video=0)
+        if self.number < 0:
+            try:
+                self.times = frame_times(self.path)
+            except ValueError as error:
+                raise OSError(brief(error)) from None
+            self.fps = float(1 / np.median(np.diff(self.times))) if len(self.times) > 1 else 30.0
+        self.number, self.lost = -1, {}
+        self.left = frames(self.path, range(len(self.times)), lost=self.lost)
+        self.next = next(self.left, None)
 
-    def read(self) -> np.ndarray:
-        try:
-            for frame in self.frames:
-                return frame.to_ndarray(format="rgb24")
-        except FFmpegError as error:  # the file is damaged here, and ends
-            raise ValueError(brief(error)) from None
-        raise Ended
-
-    def close(self) -> None:
-        if hasattr(self, "file"):
-            self.file.close()
+    def image(self, number: int) -> np.ndarray:
+        if self.next is None or self.next[0] > number:
+            raise ValueError(self.lost.get(number, "it cannot be decoded"))
+        (_, image), self.next = self.next, next(self.left, None)
+        return image
 
 
-class Folder(Source):
+class Folder(Recording):
     """The pictures of a folder in name order."""
-
-    paced = False
 
     def __init__(self, path: Path, fps: float = 30.0) -> None:
         self.path, self.fps = path, fps
 
     def open(self) -> None:
-        self.left = deque(sorted(p for p in self.path.iterdir() if p.suffix.lower() in IMAGES))
-        if not self.left:
+        self.files = sorted(p for p in self.path.iterdir() if p.suffix.lower() in IMAGES)
+        if not self.files:
             raise OSError(f"{self.path} holds no pictures ({', '.join(IMAGES)})")
+        self.times, self.number = np.arange(len(self.files)) / self.fps, -1
 
-    def read(self) -> np.ndarray:
-        if not self.left:
-            raise Ended
-        path = self.left.popleft()
-        return np.array(decode(path, path.name))
+    def image(self, number: int) -> np.ndarray:
+        return np.array(decode(self.files[number], self.files[number].name))
 
 
 class Simulated(Source):
@@ -194,12 +205,19 @@ def source(text: str, modality: str) -> Source:
             raise ValueError(f"source {text!r} needs OpenCV: pip install -e '.[live]' in mvitac's clone")
         size = (int(mode["width"]), int(mode["height"])) if mode["width"] else None
         return Camera(mode["which"].removeprefix("serial:"), size, float(mode["fps"]) if mode["fps"] else None)
+    return recording(text)
+
+
+def recording(text: str) -> Recording:
+    """The video file or the folder[@fps] that ``text`` names; ValueError if there is none, or it cannot be read."""
     name, at, rate = text.rpartition("@")
     path, fps = (Path(name), float(rate)) if at and Path(name).is_dir() else (Path(text), 30.0)
     if not 0 < fps < float("inf"):
         raise ValueError(f"source {text!r}: {rate} is no frame rate")
     if not (path.is_dir() or path.suffix.lower() in VIDEOS):
-        raise ValueError(f"source {text!r}: give a camera, a video ({', '.join(VIDEOS)}), a folder[@fps] or sim")
+        raise ValueError(
+            f"source {text!r}: give a video ({', '.join(VIDEOS)}) or a folder[@fps]; live: or a camera or sim"
+        )
     files = Folder(path, fps) if path.is_dir() else Video(path)
     try:  # now: unlike a camera, a missing file does not come back
         files.open()

@@ -34,9 +34,12 @@ class LiveConfig:
 class Contact:
     """Contact of one touch sensor: learns its background, then compares frames with it."""
 
-    def __init__(self, config: LiveConfig, side: int = 0) -> None:
-        """``side``: side in pixels of the background to keep for a model of difference images; 0 = none."""
-        self.config, self.side = config, side
+    def __init__(self, config: LiveConfig, side: int = 0, free: np.ndarray | None = None) -> None:
+        """``side``: side in pixels of the background to keep for a model of difference images; 0 = none.
+
+        ``free``: an image without contact, which is the background then, instead of the first frames.
+        """
+        self.config, self.side, self.free = config, side, free
         self.forget()
 
     def forget(self) -> None:
@@ -47,10 +50,13 @@ class Contact:
         """The background float32 [side, side, 3] at the size of the model's input."""
         self.noise = self.level = 0.0
         self.touched = self.uneasy = False
+        if self.free is not None:
+            self.background = _small(self.free)
+            self.picture = fit(self.free, self.side).astype(np.float32) if self.side else None
 
     def __call__(self, image: np.ndarray) -> bool | None:
         """True in contact, False without, None while calibrating; sets ``level``, the change over the threshold."""
-        small = np.asarray(Image.fromarray(image).convert("L").resize((SIDE, SIDE), Image.Resampling.BOX), np.float32)
+        small = _small(image)
         whole = fit(image, self.side) if self.side else None
         if self.background is None:
             self.first.append((small, whole))
@@ -77,3 +83,8 @@ class Contact:
             if whole is not None and self.picture is not None:
                 self.picture += self.config.follow * (whole - self.picture)
         return self.touched
+
+
+def _small(image: np.ndarray) -> np.ndarray:
+    """float32 [SIDE, SIDE], gray."""
+    return np.array(Image.fromarray(image).convert("L").resize((SIDE, SIDE), Image.Resampling.BOX), np.float32)

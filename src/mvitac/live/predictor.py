@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,8 @@ class Live:
         nearest: Callable[[dict[str, np.ndarray]], list[str]] | None = None,
         record: Callable[[dict[str, np.ndarray], dict[str, Any]], None] | None = None,
         tell: Callable[[Event], None] = lambda event: None,
+        free: Sequence[np.ndarray] = (),
+        always: bool = False,
     ) -> None:
         """
         Args:
@@ -72,13 +75,15 @@ class Live:
             nearest: turns the engine's outputs into descriptions of known touches.
             record: called with every pair that was used (images, columns).
             tell: called with every fault as it happens, in the thread that noticed it.
+            free: an image of each touch sensor without contact; none: the first frames show it.
+            always: predict from every frame; without contact, an answer is that of its frame alone.
 
         Raises:
             ValueError: the engine takes other inputs.
         """
         _check_inputs(engine, streams)
         self.engine, self.streams, self.config, self.clock = engine, streams, config, clock
-        self.nearest, self.record, self.tell = nearest, record, tell
+        self.nearest, self.record, self.tell, self.always = nearest, record, tell, always
         self.all = [s for several in streams.values() for s in several]
         self.leading = (streams.get("touch") or streams["vision"])[0]  # the stream whose new frames start predictions
         _check_window(engine)
@@ -87,7 +92,11 @@ class Live:
         """Whether the learned background is subtracted from touch. It also stands for the first frame of a touch."""
         side = engine.inputs["touch"][0] if self.minus_rest and "touch" in streams else 0
         self._since: dict[str, float] = {}
-        self.contacts = {s.name: Contact(config, side) for s in streams.get("touch", ())}
+        touch = streams.get("touch", ())
+        if len(free) not in (0, len(touch)):
+            raise ValueError(f"{len(free)} background(s) for {len(touch)} touch sensor(s): give one of each, or none")
+        pairs = zip_longest(touch, free)
+        self.contacts = {stream.name: Contact(config, side, image) for stream, image in pairs if stream}
         self.counts: Counter[str] = Counter()
         self._ages = np.zeros(NUM_AGES)
         self.age = self.max_age = 0.0
@@ -95,17 +104,19 @@ class Live:
         self.num_predictions = self.num_stale = self.num_touches = 0
         self.touch: Touch | None = None
         self.last: Touch | None = None
+        self.answer: Touch | None = None
+        """What the latest prediction says: the current touch, or a frame without contact (``always``)."""
         self.contact: bool | None = None
         self._seen = -1
         self._judged: dict[str, int] = {}
         self._changed: set[str] = set()
         for stream in self.all:
             stream.tell = self._heard
-        self._remember()
+        self.remember()
 
     def tick(self) -> bool:
         """Use the newest frames if the leading stream has a new one; True if that made a prediction."""
-        self._remember()
+        self.remember()
         for stream in self.all:
             stream.check()
         leading = self.leading.newest(take=False)
@@ -121,16 +132,33 @@ class Live:
             self.num_stale += 1
             self._lose(now)
             return False
-        self.contact = self._contact(frames.get("touch", []))
-        seen = {m: [fit(f.image, self.engine.inputs[m][0]) for f in found if f] for m, found in frames.items()}
-        images = {m: np.concatenate(several, axis=2) for m, several in seen.items()}
-        if self.contact:
-            self._predict(frames, images, now)
-        else:
+        images, given = self.see({m: [frame for frame in found if frame] for m, found in frames.items()})
+        if not self.contact:
             self._release(now)
+        if given:
+            self._predict(given, min(f.time for f in frames[self._leading_modality] if f), now)
         if self.record:
             self.record(images, {"time": now, "contact": bool(self.contact), "touch_number": self.num_touches})
-        return bool(self.contact)
+        return given is not None
+
+    def see(self, frames: dict[str, list[Frame]]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray] | None]:
+        """Find contact in the newest ``frames`` of every stream.
+
+        Returns them at the model's size, and what the model gets of them, both uint8 [S, S, C] by modality; None instead
+        of the latter where there is nothing to predict.
+        """
+        before, self.contact = self.contact, self._contact(frames.get("touch", []))
+        seen = {m: [fit(f.image, self.engine.inputs[m][0]) for f in found] for m, found in frames.items()}
+        images = {m: np.concatenate(several, axis=2) for m, several in seen.items()}
+        if self.contact and not before:
+            self.num_touches += 1
+        if bool(self.contact) != bool(before) or not self._since:
+            pairs = (pair for m in frames for pair in zip(self.streams[m], frames[m], strict=True))
+            self._since = {stream.name: frame.time for stream, frame in pairs}
+        if not (self.contact or (self.always and (self.contact is False or not self.minus_rest))):
+            return images, None
+        given = {m: self._as_trained(m, self._window(m, frames[m], image)) for m, image in images.items()}
+        return images, {m: np.concatenate(several, axis=2) for m, several in given.items()}
 
     def step(self) -> dict[str, Any] | None:
         """``tick``, and what is new: a prediction, or that a touch has ended, JSON-ready; else None."""
@@ -145,22 +173,20 @@ class Live:
             for stream, frame in zip(several, found, strict=True)
         )
 
-    def _predict(self, frames: dict[str, list[Frame | None]], images: dict[str, np.ndarray], now: float) -> None:
-        """Add a prediction for the newest ``frames``, resized to ``images``, to the current touch, or start one."""
-        captured = min(f.time for f in frames[self._leading_modality] if f)
-        if self.touch is None:
-            self.num_touches += 1
-            self.touch = Touch(self.num_touches, now)
-            pairs = (pair for m in frames for pair in zip(self.streams[m], frames[m], strict=True))
-            self._since = {stream.name: frame.time for stream, frame in pairs if frame}
-        given = {m: self._as_trained(m, self._window(m, frames[m], image)) for m, image in images.items()}
-        outputs = self.engine(**{m: np.concatenate(several, axis=2)[None] for m, several in given.items()})
-        self.touch.add(
+    def _predict(self, given: dict[str, np.ndarray], captured: float, now: float) -> None:
+        """Add a prediction from what the model gets to the current touch, or start one."""
+        if not self.contact:
+            self.answer = Touch(self.num_touches, now)
+        elif self.touch is None:
+            self.touch = self.answer = Touch(self.num_touches, now)
+        assert self.answer
+        outputs = self.engine(**{m: image[None] for m, image in given.items()})
+        self.answer.add(
             {task: outputs[f"probability_{task}"][0] for task in self.engine.classes},
             {task: outputs[f"value_{task}"][0] for task in self.engine.values},
         )
         if self.nearest:
-            self.touch.known = self.nearest(outputs)
+            self.answer.known = self.nearest(outputs)
         self.age = self.clock() - captured
         self._ages[self.num_predictions % NUM_AGES] = self.age
         self.max_age = max(self.max_age, self.age)
@@ -174,14 +200,14 @@ class Live:
     def _leading_modality(self) -> str:
         return "touch" if self.streams.get("touch") else "vision"
 
-    def _contact(self, frames: Sequence[Frame | None]) -> bool | None:
+    def _contact(self, frames: Sequence[Frame]) -> bool | None:
         """Whether any touch sensor is in contact; None during calibration; always True without a sensor."""
         if not self.contacts:
             return True
         while self._changed:
             self.contacts[self._changed.pop()].forget()
         for name, frame in zip(self.contacts, frames, strict=True):
-            if frame is None or self._judged.get(name) == frame.number:
+            if self._judged.get(name) == frame.number:
                 continue
             self._judged[name] = frame.number
             contact = self.contacts[name]
@@ -195,14 +221,13 @@ class Live:
         states = self.contacts.values()
         return None if any(c.background is None for c in states) else any(c.touched for c in states)
 
-    def _window(self, modality: str, frames: list[Frame | None], newest: np.ndarray) -> list[np.ndarray]:
+    def _window(self, modality: str, frames: list[Frame], newest: np.ndarray) -> list[np.ndarray]:
         """The frames [S, S, C] that the model looks at, newest first: ``newest``, and older ones by their time."""
         if frames_of(self.engine.window, modality) == 1:
             return [newest]
         sensors = []
         for stream, frame in zip(self.streams[modality], frames, strict=True):
-            if frame:
-                sensors.append(stream.window(frame, self._back(stream), self._since.get(stream.name, frame.time)))
+            sensors.append(stream.window(frame, self._back(stream), self._since[stream.name]))
         return [newest, *(np.concatenate(each, axis=2) for each in list(zip(*sensors, strict=True))[1:])]
 
     def _back(self, stream: Stream) -> list[float]:
@@ -211,7 +236,7 @@ class Live:
         unit = 1.0 if window["order"] == "time" else stream.interval() or 0.0
         return [k * window["stride"] * unit for k in range(window["frames"])]
 
-    def _remember(self) -> None:
+    def remember(self) -> None:
         """Let the streams keep as much as a window needs."""
         for modality in (m for m in self.streams if frames_of(self.engine.window, m) > 1):
             for stream in self.streams[modality]:
@@ -231,6 +256,7 @@ class Live:
         self.contact = None
 
     def _release(self, now: float) -> None:
+        self.answer = None
         if self.touch is not None:
             self.touch.end = now
             self.last, self.touch = self.touch, None
@@ -250,18 +276,18 @@ class Live:
         return {task: touch.answer(task, classes) for task, classes in self.engine.classes.items()}
 
     def prediction(self) -> dict[str, Any]:
-        """The newest prediction of the current touch, JSON-ready; without contact, that alone."""
-        said: dict[str, Any] = {"touch": self.num_touches, "contact": self.touch is not None}
-        if self.touch is None:
+        """The newest prediction, JSON-ready; without contact, that alone (unless ``always``)."""
+        said: dict[str, Any] = {"touch": self.num_touches, "contact": self.contact if self.answer else False}
+        if self.answer is None:
             return said
         said["age_ms"] = 1000 * self.age
-        for task, (name, confidence) in self.answers(self.touch).items():
+        for task, (name, confidence) in self.answers(self.answer).items():
             said[task] = {"class": name, "confidence": confidence}
         for task, targets in self.engine.values.items():
-            found = zip(targets, self.touch.values[task].tolist(), strict=True)
+            found = zip(targets, self.answer.values[task].tolist(), strict=True)
             said[task] = {t["name"]: {"value": v, "unit": t["unit"], "spread": spread_at(t, v)} for t, v in found}
-        if self.touch.known:
-            said["known"] = self.touch.known
+        if self.answer.known:
+            said["known"] = self.answer.known
         return said
 
     def summary(self) -> dict[str, Any]:

@@ -95,7 +95,7 @@ class Stream:
         except Exception as error:  # OSError, or one of the exceptions of OpenCV and its drivers
             self._lost(error)
             return
-        self._take(image)
+        self.take(image)
 
     def newest(self, *, take: bool = True) -> Frame | None:
         """The newest frame of any age; with ``take`` it counts as used, not as dropped."""
@@ -140,7 +140,8 @@ class Stream:
         self.origin.close()
         self._open = False
 
-    def _take(self, image: np.ndarray) -> None:
+    def take(self, image: np.ndarray) -> None:
+        """Make ``image`` the newest frame, now."""
         now, before = self.clock(), self._newest
         if self.fault in ("unplugged", "stalled"):
             self._recovered()

@@ -3,10 +3,8 @@
 Shapes: images are uint8 [N, H, W, C] in the pack and are returned as [B, C, H, W] (channels-last).
 """
 
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,8 +12,8 @@ from torch import Tensor
 
 from mvitac.data.pack import Images, Pack
 from mvitac.methods.base import Views
+from mvitac.system.prefetch import prefetch
 
-T = TypeVar("T")
 SHARE = 0.4  # share of the free GPU memory that a copy of the pack may take
 
 
@@ -70,16 +68,3 @@ def ahead(batches: Iterator[Views], device: torch.device) -> Iterator[Views]:
         for tensor in [batch.rows, batch.seed, *answers, *(v for views in batch.images.values() for v in views)]:
             tensor.record_stream(stream)  # else its memory could be reused while the network reads it
         yield batch
-
-
-def prefetch(items: Iterator[T], depth: int = 2) -> Iterator[T]:
-    """Prepare up to ``depth`` of the next ``items`` in a thread. Errors are raised in place of the item."""
-    end: Any = object()
-    with ThreadPoolExecutor(1, "prefetch") as thread:
-        coming = deque(thread.submit(next, items, end) for _ in range(depth))
-        try:
-            while (item := coming.popleft().result()) is not end:
-                coming.append(thread.submit(next, items, end))
-                yield item
-        finally:
-            thread.shutdown(cancel_futures=True)

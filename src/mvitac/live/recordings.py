@@ -1,0 +1,154 @@
+"""Predict from recordings: every frame of videos, folders of pictures or a pack, in batches, as ``Live`` would see it.
+
+A table is a dict of columns: ``frame`` (its number) and ``time`` [s]; ``contact`` and ``touch`` (number of touches so
+far), if the sensor was seen without contact; of a pack ``id``, ``group`` and ``split``; and for each task those of
+``answers``.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from itertools import islice
+from typing import Any
+
+import numpy as np
+
+from mvitac.data.pack import Pack
+from mvitac.data.spec import Window
+from mvitac.data.windows import windowed
+from mvitac.deploy.engine import Engine, spread_at
+from mvitac.live.cameras import Recording
+from mvitac.live.contact import LiveConfig
+from mvitac.live.predictor import Live
+from mvitac.live.streams import Stream
+from mvitac.registry import from_json
+from mvitac.system.prefetch import prefetch
+
+BATCH = 32
+TOGETHER = 0.5  # seconds by which frames of several recordings may be apart
+Table = dict[str, Any]
+
+
+def answers(engine: Engine, outputs: dict[str, np.ndarray]) -> Table:
+    """The columns of the engine's ``outputs``.
+
+    Of classes: ``TASK``, ``TASK.confidence`` and ``TASK.CLASS``, its probability. Of values: ``TARGET [UNIT]`` and
+    ``TARGET.spread [UNIT]``, the usual error of test rows in the same range; ``TASK.TARGET`` where a task has several.
+    """
+    table: Table = {}
+    for task, classes in engine.classes.items():
+        p = outputs[f"probability_{task}"]
+        table |= {task: np.array(classes)[p.argmax(1)], f"{task}.confidence": p.max(1)}
+        table |= {f"{task}.{name}": p[:, k] for k, name in enumerate(classes)}
+    for task, targets in engine.values.items():
+        for target, found in zip(targets, outputs[f"value_{task}"].T, strict=True):
+            name, unit = target["name"] if len(targets) == 1 else f"{task}.{target['name']}", target["unit"]
+            table[f"{name} [{unit}]"] = found
+            table[f"{name}.spread [{unit}]"] = [spread_at(target, value) for value in found.tolist()]
+    return table
+
+
+def pack_tables(engine: Engine, pack: Pack) -> Iterator[Table]:
+    """Tables of the rows of a pack that have all images; ValueError if the model was trained on others."""
+    if pack.spec.difference != engine.difference:
+        raise ValueError(f"{pack.path}: touch minus its background, in the model or in the pack only")
+    if engine.window:
+        pack = windowed(pack, from_json(Window, {k: v for k, v in engine.window.items() if k != "layout"}))
+    rows = np.flatnonzero(np.logical_and.reduce([pack.has(m) for m in engine.inputs]))
+    known = [name for name in ("time", "contact", "id", "group", "split") if name in pack.table.column_names]
+    chunks = np.split(rows, range(BATCH, len(rows), BATCH))
+    for chunk, images in prefetch((chunk, {m: pack.images[m][chunk] for m in engine.inputs}) for chunk in chunks):
+        yield {
+            "frame": chunk,
+            **{name: pack.column(name)[chunk] for name in known},
+            **answers(engine, engine(**images)),
+        }
+
+
+class Recordings:
+    """Recordings of all cameras and sensors of a model, made at the same time.
+
+    Attributes:
+        num: Frames of the first touch sensor, or of the camera where there is none.
+        left_out: Of these, how many were damaged, or more than ``TOGETHER`` away from those of another recording.
+        calibrated: Whether every touch sensor was seen without contact.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        files: dict[str, list[Recording]],
+        config: LiveConfig = LiveConfig(),
+        free: Sequence[np.ndarray] = (),
+    ) -> None:
+        """``files`` are as the streams of ``Live``, and ``free`` is as there.
+
+        Raises:
+            ValueError: The engine takes others, or needs the sensor without contact, which is nowhere to be seen.
+        """
+        self.engine, self.left_out = engine, 0
+        self.files: dict[Stream, Recording] = {}
+        streams: dict[str, Sequence[Stream]] = {}
+        for modality, several in files.items():
+            for file in several:
+                file.open()
+            streams[modality] = [Stream(f"{modality} {i}", f, clock=_time(f)) for i, f in enumerate(several)]
+            self.files |= dict(zip(streams[modality], several, strict=True))
+        self.live = Live(engine, streams, config, free=free, always=True)
+        self.calibrated = all(self._calibrate(stream) for stream in streams.get("touch", ()))
+        if self.live.minus_rest and not self.calibrated:
+            num = config.calibration
+            raise ValueError(
+                f"the model needs the sensor without contact, and no {num} frames show it: give --background"
+            )
+        self.num = len(self.files[self.live.leading].times)
+
+    def _calibrate(self, stream: Stream) -> bool:
+        """Learn the background of a touch sensor from its first frames, or the first without contact."""
+        contact, file = self.live.contacts[stream.name], self.files[stream]
+        while contact.background is None and file.number + 1 < len(file.times):
+            with suppress(ValueError):  # a damaged frame
+                contact(file.read())
+        file.open()
+        return contact.background is not None
+
+    def tables(self) -> Iterator[Table]:
+        """Tables of up to ``BATCH`` frames; the next are read while the engine computes."""
+        for numbers, times, contact, touch, images in prefetch(self._batches()):
+            table = {"frame": numbers, "time": np.round(times, 6)}
+            if self.live.contacts and self.calibrated:
+                table |= {"contact": contact, "touch": touch}
+            given = {m: np.stack([each[m] for each in images]) for m in self.engine.inputs}
+            yield table | answers(self.engine, self.engine(**given))
+
+    def _batches(self) -> Iterator[tuple[Any, ...]]:
+        rows = self._rows()
+        while batch := list(islice(rows, BATCH)):
+            yield tuple(zip(*batch, strict=True))
+
+    def _rows(self) -> Iterator[tuple[int, float, bool | None, int, dict[str, np.ndarray] | None]]:
+        """Number, time, contact and touch of each frame, and what the model gets of it."""
+        leading = self.live.leading
+        for number, time in enumerate(self.files[leading].times.tolist()):
+            for stream, file in self.files.items():
+                while file.number < 0 or (file.number < number if stream is leading else _nearer(file, time)):
+                    with suppress(ValueError):  # a damaged frame
+                        stream.take(file.read())
+            newest = {m: [stream.newest() for stream in several] for m, several in self.live.streams.items()}
+            apart = [abs(f.time - time) if f else np.inf for several in newest.values() for f in several]
+            found = leading.newest()
+            if max(apart) > TOGETHER or found is None or found.time != time:
+                self.left_out += 1
+                continue
+            self.live.remember()
+            _, given = self.live.see(newest)  # type: ignore[arg-type]
+            yield number, time, self.live.contact, self.live.num_touches, given
+
+
+def _time(file: Recording) -> Callable[[], float]:
+    return lambda: file.time
+
+
+def _nearer(file: Recording, time: float) -> bool:
+    """Whether the next frame of ``file`` is as near to ``time`` as the one that was read last."""
+    after = file.times[file.number + 1 : file.number + 2]
+    return bool(len(after) and abs(after[0] - time) <= abs(file.time - time))

@@ -1,0 +1,156 @@
+"""Recordings: every frame has its number, its time and the answer that the engine gives for it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.csv
+import pytest
+from PIL import Image
+
+from mvitac.cli.main import main
+from mvitac.data.images import difference, fit
+from mvitac.data.pack import Pack
+from mvitac.data.video import frames
+from mvitac.deploy.engine import Engine
+from mvitac.live.cameras import Recording, recording
+from mvitac.live.contact import LiveConfig
+from mvitac.live.recordings import Recordings, pack_tables
+from support.videos import write_video
+
+NUM, FREE = 50, 20
+FIRST = LiveConfig(calibration=8)
+
+
+@pytest.fixture(scope="module")
+def engine(onnx: Path) -> Engine:
+    return Engine(onnx, threads=1)
+
+
+@pytest.fixture(scope="module")
+def films(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """50 frames of touch at 25 a second, 20 without contact, and 24 of vision at 12."""
+    folder = tmp_path_factory.mktemp("films")
+    noise = np.random.default_rng(0).integers(0, 4, (NUM, 120, 160, 3))
+
+    def touch(number: int) -> np.ndarray:
+        image = np.full((120, 160, 3), 100) + noise[number]
+        if number >= FREE:
+            image[30:90, 40:120] += 80
+        return image.astype(np.uint8)
+
+    def vision(number: int) -> np.ndarray:
+        return np.full((120, 160, 3), 10 * number, np.uint8)
+
+    write_video(folder / "touch.mp4", NUM, touch)
+    write_video(folder / "vision.mp4", 24, vision, rate=12)
+    return {m: folder / f"{m}.mp4" for m in ("vision", "touch")}
+
+
+def opened(films: dict[str, Path]) -> dict[str, list[Recording]]:
+    return {m: [recording(str(path))] for m, path in films.items()}
+
+
+def whole(tables: Any) -> dict[str, np.ndarray]:
+    found = list(tables)
+    return {name: np.concatenate([table[name] for table in found]) for name in found[0]}
+
+
+def test_every_frame_is_answered_as_the_engine_answers_it(engine: Engine, films: dict[str, Path]) -> None:
+    """With the nearest frame of the camera, and contact known from the first frame on."""
+    table = whole(Recordings(engine, opened(films), FIRST).tables())
+    assert table["frame"].tolist() == list(range(NUM))
+    assert table["time"] == pytest.approx(np.arange(NUM) / 25)
+    assert table["contact"].tolist() == [False] * FREE + [True] * (NUM - FREE)
+    assert table["touch"].tolist() == [0] * FREE + [1] * (NUM - FREE)
+    images = {m: dict(frames(path, range(NUM), lost={})) for m, path in films.items()}
+    for number in (0, 7, 33, NUM - 1):
+        nearest = min(images["vision"], key=lambda i: abs(i / 12 - number / 25))
+        pair = {"vision": images["vision"][nearest], "touch": images["touch"][number]}
+        outputs = engine(**{m: fit(image, 32)[None] for m, image in pair.items()})
+        p = outputs["probability_pattern"][0]
+        names = [f"pattern.{name}" for name in engine.classes["pattern"]]
+        assert [table[name][number] for name in names] == pytest.approx(p, abs=1e-5)
+        assert f"pattern.{table['pattern'][number]}" == names[p.argmax()]
+        assert table["pattern.confidence"][number] == pytest.approx(p.max(), abs=1e-5)
+
+
+def test_frames_without_a_partner_and_damaged_ones_are_left_out(
+    engine: Engine, films: dict[str, Path], tmp_path: Path
+) -> None:
+    write_video(tmp_path / "short.mp4", 12, lambda number: np.zeros((120, 160, 3), np.uint8), rate=12)
+    late = Recordings(engine, opened({**films, "vision": tmp_path / "short.mp4"}), FIRST)
+    assert whole(late.tables())["frame"].tolist() == list(range(36))  # until half a second after the camera's last
+    assert late.left_out == NUM - 36
+    for number in range(NUM):
+        image = np.full((32, 32, 3), 100 if number < FREE else 160, np.uint8)
+        Image.fromarray(image).save(tmp_path / f"{number:02d}.png")
+    (tmp_path / "03.png").write_bytes(b"damaged")
+    files = opened(films) | {"touch": [recording(f"{tmp_path}@25")]}
+    hurt = Recordings(engine, files, FIRST)
+    table = whole(hurt.tables())
+    assert table["frame"].tolist() == [i for i in range(NUM) if i != 3] and hurt.left_out == 1
+    assert table["time"][3] == pytest.approx(4 / 25)
+
+
+def test_a_model_of_difference_images_needs_the_free_sensor(
+    engine: Engine, films: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wherever it is shown; a recording that is in contact from end to end needs an image of it."""
+    monkeypatch.setattr(engine, "difference", True)
+    first = next(frames(films["touch"], [0]))[1]
+    for config, free in ((FIRST, ()), (LiveConfig(calibration=NUM + 1), [first])):
+        rows = list(Recordings(engine, opened(films), config, free)._rows())
+        assert len(rows) == NUM and rows[0][4]["touch"][16, 16].mean() == pytest.approx(128, abs=3)
+        assert rows[-1][4]["touch"][16, 16].mean() == pytest.approx(168, abs=3)
+    last = difference(fit(next(frames(films["touch"], [NUM - 1]))[1], 32), fit(first, 32))
+    assert np.abs(rows[-1][4]["touch"].astype(int) - last).max() <= 2
+    with pytest.raises(ValueError, match="give --background"):
+        Recordings(engine, opened(films), LiveConfig(calibration=NUM + 1))
+
+
+def test_a_pack_is_answered_row_by_row(engine: Engine, pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+    table = whole(pack_tables(engine, pack))
+    assert table["frame"].tolist() == list(range(pack.num))
+    assert table["id"].tolist() == pack.column("id").tolist()
+    outputs = engine(**{m: pack.images[m][100:110] for m in engine.inputs})
+    assert table["pattern.rows"][100:110] == pytest.approx(outputs["probability_pattern"][:, 1], abs=1e-5)
+    monkeypatch.setattr(engine, "difference", True)
+    with pytest.raises(ValueError, match="minus its background"):
+        next(pack_tables(engine, pack))
+
+
+def test_values_have_their_unit_and_spread(value_onnx: Path, measured: Pack) -> None:
+    engine = Engine(value_onnx, threads=1)
+    table = whole(pack_tables(engine, measured))
+    target = engine.values["both"][1]
+    outputs = engine(**{m: measured.images[m][:8] for m in engine.inputs})
+    assert table["both.weight [N]"][:8] == pytest.approx(outputs["value_both"][:, 1], abs=1e-4)
+    assert set(table["both.weight.spread [N]"].tolist()) <= set(target["spread"])
+
+
+def test_predict_command(
+    onnx: Path, films: dict[str, Path], pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command, out = ["predict", str(onnx)], tmp_path / "p.csv"
+    both = ["--vision", str(films["vision"]), "--touch", str(films["touch"])]
+    assert main([*command, *both, "--out", str(out), "--calibration", "8"]) == 0
+    assert "50 frames" in capsys.readouterr().err
+    table = pyarrow.csv.read_csv(out)
+    assert table.column_names[:5] == ["frame", "time", "contact", "touch", "pattern"] and table.num_rows == NUM
+    assert table.column("contact").to_pylist() == [False] * FREE + [True] * (NUM - FREE)
+    assert main([*command, str(pack.path), "--out", str(out)]) == 0
+    assert pyarrow.csv.read_csv(out).num_rows == pack.num
+    capsys.readouterr()
+    wrong = {
+        (): "give one SOURCE",
+        (str(pack.path), *both): "give one SOURCE",
+        (str(films["touch"]),): "takes vision and touch",
+        tuple(both[2:]): "takes 1 vision stream",
+        ("--vision", "0", *both[2:]): "give a video",
+    }
+    for words, says in wrong.items():
+        assert main([*command, *words]) == 2
+        assert says in capsys.readouterr().err
