@@ -197,7 +197,7 @@ def test_lerobot_reads_values_and_elements_of_vectors(tmp_path: Path) -> None:
     values, _ = measured(pack)
     assert np.allclose(values, np.stack([np.arange(30) / 4, at % 100 / 10], axis=1))
     assert "observation.state" not in str(plain.read(0))  # without such values, nothing changes
-    with pytest.raises(ValueError, match=r"state\[2\] does not exist: observation.state has 2 numbers, .*state\[1\]"):
+    with pytest.raises(ValueError, match=r"state\[2\] does not exist: observation.state has 2 numbers"):
         LeRobotConfig(path=root, size=16, values=("observation.state[2]:mm",)).source()
 
 

@@ -224,7 +224,7 @@ BAD: dict[str, tuple[dict[str, Any], dict[str, str], str]] = {
         r"/gel is uint8 \[20, 3, 16, 16\]: images mus",
     ),
     "nothing in it": ({}, {}, r"a\.h5 holds no datasets"),
-    "no rows": ({"camera": grays(), "gel": grays()}, {}, "the image datasets have no rows"),
+    "no rows": ({"camera": grays(), "gel": grays()}, {}, "holds no rows"),
     "text for a number": (
         flat(force_n=["1", "2 N"] * 10),
         {},

@@ -165,10 +165,9 @@ def test_the_contract(packs: dict[str, Pack], clones: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", SETS)
 def test_something_else_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
-    for path, says in ((tmp_path / "nowhere", "does not exist"), (tmp_path, "holds no ")):
-        assert main(["data", "pack", "--data", name, "--path", str(path), "--out", str(tmp_path / "p")]) == 2
-        error = capsys.readouterr().err
-        assert says in error and "git clone https://github.com/" in error and error.count("\n") == 1
+    assert main(["data", "pack", "--data", name, "--path", str(tmp_path), "--out", str(tmp_path / "p")]) == 2
+    error = capsys.readouterr().err
+    assert "holds no " in error and "git clone https://github.com/" in error and error.count("\n") == 1
 
 
 def test_the_command(clones: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

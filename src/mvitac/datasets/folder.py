@@ -31,8 +31,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from mvitac.datasets.table.hdf5 import find_hdf5, read_hdf5
-from mvitac.datasets.table.manifest import Manifest, find_manifest, list_class_folders, read_manifest
+from mvitac.datasets.table.hdf5 import read_hdf5
+from mvitac.datasets.table.image_refs import HDF5
+from mvitac.datasets.table.manifest import READERS, Manifest, list_class_folders, read_manifest
 from mvitac.datasets.table.table import RowsConfig
 
 
@@ -49,10 +50,17 @@ class FolderConfig(RowsConfig):
     """Modality of plain class folders (<root>/<class>/*.jpg)."""
 
     def manifest(self) -> Manifest:
-        arrays = find_hdf5(self.path)
-        if file := None if self.path in arrays else find_manifest(self.path):
-            return read_manifest(file)
-        if arrays:
+        files = sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
+        if not self.path.exists():
+            raise ValueError(f"{self.path} does not exist: give a manifest, an HDF5 file or a folder as --data.path")
+        tables = [f for f in files if f.suffix.lower() in READERS and (f == self.path or f.stem == "manifest")]
+        if len(tables) > 1:
+            raise ValueError(f"{self.path} holds {' and '.join(f.name for f in tables)}: give the path of one of them")
+        if tables:
+            return read_manifest(tables[0])
+        if arrays := [file for file in files if file.suffix.lower() in HDF5 and file.is_file()]:
             images = [name for name in (self.vision, *self.touch, *self.background) if name]
             return read_hdf5(self.path, arrays, images, self.vectors())
-        return list_class_folders(self.path, pictures=self.pictures, allow_missing=self.allow_missing)
+        if not self.path.is_dir():
+            raise ValueError(f"{self.path} is no table: its name must end in {', '.join((*READERS, *HDF5))}")
+        return list_class_folders(self.path, self.pictures)

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from mvitac.datasets.table.image_refs import ImageRef, ParquetCell
 from mvitac.datasets.table.manifest import Manifest, text_of
 from mvitac.datasets.table.table import RowsConfig
-from mvitac.system.files import brief, digest, parse_json
+from mvitac.system.files import brief, parse_json
 
 SPLITS = {"train": "train", "validation": "val", "valid": "val", "val": "val", "test": "test"}
 
@@ -45,9 +45,8 @@ class HubConfig(RowsConfig):
             if all(sides):
                 for row in rows[before:]:
                     row.setdefault("split", str(side))
-        names = tuple(dict.fromkeys(name for row in rows for name in row))
         nameless = [file.name for file, side in zip(files, sides, strict=True) if not side]
-        if any(sides) and nameless and not self.split and "split" not in names:
+        if any(sides) and nameless and not self.split and not any("split" in row for row in rows):
             raise ValueError(
                 f"{self.path}: the name of {nameless[0]} says no split, others do: begin it with train-, validation- or"
                 " test-, remove it, or --data.split by-group assigns all rows to splits"
@@ -55,7 +54,7 @@ class HubConfig(RowsConfig):
         for column, places in found.items():
             if len(places) < len(rows):
                 raise ValueError(f"{self.path}: image column {column!r} is not in every file")
-        return Manifest(self.path, self.path, names, rows, digest([rows, sorted(found)]), found)
+        return Manifest.of(self.path, rows, found, content=sorted(found))
 
 
 def _read(

@@ -18,7 +18,7 @@ from mvitac.data.images import IMAGES
 from mvitac.datasets.table.image_refs import ImageRef, TarMember
 from mvitac.datasets.table.manifest import Manifest, text_of
 from mvitac.datasets.table.table import RowsConfig
-from mvitac.system.files import brief, digest, parse_json
+from mvitac.system.files import brief, parse_json
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,10 +43,8 @@ class WebDatasetConfig(RowsConfig):
         columns = list(dict.fromkeys(c for found in places.values() for c in found))
         if not columns:
             raise ValueError(f"{self.path} holds no images ({', '.join(IMAGES)}): is it a WebDataset?")
-        names = tuple(dict.fromkeys(name for row in samples.values() for name in row))
-        rows = [{name: row.get(name, "") for name in names} for key, row in samples.items() if key in places]
         found = {c: [places[key].get(c) for key in samples if key in places] for c in columns}
-        return Manifest(self.path, self.path, names, rows, digest([rows, columns]), found)
+        return Manifest.of(self.path, [row for key, row in samples.items() if key in places], found, content=columns)
 
     def _index(self, shard: Path, samples: dict[str, dict[str, str]], places: dict[str, dict[str, ImageRef]]) -> None:
         """Add the members of ``shard``, which must not be compressed."""

@@ -27,7 +27,7 @@ from mvitac.datasets.table.image_refs import Frame, ImageRef, ParquetCell
 from mvitac.datasets.table.manifest import Manifest, text_of
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.registry import check_range, unknown
-from mvitac.system.files import brief, digest, read_json
+from mvitac.system.files import brief, read_json
 
 VERSION = "v3.0"
 FELT = re.compile(r"touch|tactile|gelsight|digit(?!al)|gel\b|finger", re.IGNORECASE)  # usual names of tactile cameras
@@ -69,8 +69,7 @@ class LeRobotConfig(RowsConfig):
         for column, key in names.items():
             found[column] = cells[key] if key in cells else self._in_videos(info, key, rows)
         where = {c: [str(place).removeprefix(str(self.path)) for place in places] for c, places in found.items()}
-        columns = tuple(dict.fromkeys(name for row in rows for name in row))
-        return Manifest(self.path, self.path, columns, rows, digest([rows, where]), found)
+        return Manifest.of(self.path, rows, found, content=where)
 
     def _in_videos(self, info: dict[str, Any], key: str, rows: Sequence[dict[str, str]]) -> list[ImageRef | None]:
         """Return the frame of camera ``key`` at each row's time; None if no frame is near enough."""

@@ -1,46 +1,65 @@
-"""Converts a manifest's text cells to a pack's columns: labels, controls, groups, splits and ids."""
+"""Converts a table's text cells to a pack's columns: labels, values, controls. And conditions on rows."""
 
 import math
+import operator
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from mvitac.data.checks.table_checks import KEYS
 from mvitac.data.pack_table import SPLITS
 from mvitac.data.spec import UNGROUPED, Target, Task, ValueTask, listed
-from mvitac.datasets.table.image_columns import Selection
-from mvitac.datasets.table.manifest import Manifest, number_of, text_of
+from mvitac.datasets.table.manifest import Manifest, Row, normal, number_of, text_of
 
 MAX_ONE_HOT = 64
+COMPARE: dict[str, Callable[[float, float], bool]] = {"<=": operator.le, ">=": operator.ge}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Grouping:
-    """The group and touch group of each row, and what they are called."""
+@dataclass(frozen=True)
+class Condition:
+    """A row filter: a column, one of = != <= >=, and a value."""
 
-    groups: list[str]
-    group_by: str
-    touch_groups: list[str]
-    touch_group_by: str
+    column: str
+    sign: str
+    value: str
+
+    @classmethod
+    def parse(cls, text: str) -> "Condition":
+        match = re.fullmatch(r"\s*([^<>=!]+?)\s*(<=|>=|!=|=)\s*([^<>=!]*?)\s*", text)
+        if match is None or (match[2] in COMPARE and number_of(match[3]) is None):
+            raise ValueError(f"condition {text!r}: write column=value, column!=value, column<=number or column>=number")
+        return cls(*match.groups())
+
+    def holds(self, row: Row) -> bool:
+        """Return whether ``row`` meets the condition; an empty cell is neither <= nor >= anything."""
+        cell, wanted = row[self.column], normal(text_of(self.value))
+        if self.sign in COMPARE:
+            number = number_of(cell)
+            return number is not None and COMPARE[self.sign](number, float(wanted))
+        return (cell == wanted) == (self.sign == "=")
 
 
-def read_task(selected: Selection, column: str, counts: Sequence[bool]) -> tuple[Task, list[int]]:
+def all_hold(conditions: Iterable[str], table: Manifest) -> list[bool]:
+    """Return, for each row, whether it meets all of ``conditions``."""
+    parsed = [Condition.parse(text) for text in conditions]
+    return [all(condition.holds(row) for condition in parsed) for row in table.rows]
+
+
+def read_task(table: Manifest, column: str, counts: Sequence[bool]) -> tuple[Task, list[int]]:
     """Return the task of a label column and its class number per row, -1 if unlabelled or not in ``counts``."""
-    cells = [row[column] if counted else "" for row, counted in zip(selected.rows, counts, strict=True)]
+    cells = [row[column] if counted else "" for row, counted in zip(table.rows, counts, strict=True)]
     names = {cell for cell in cells if cell}
     labelled = sum(bool(cell) for cell in cells)
     if len(names) < 2:
         what = f"only the class {min(names)!r}" if names else "no labels"
-        raise ValueError(f"{selected.where}: column {column!r} has {what} in {len(cells)} rows: a task needs two")
+        raise ValueError(f"{table.path}: column {column!r} has {what} in {len(cells)} rows: a task needs two")
     if len(names) == labelled >= 10:
         raise ValueError(
-            f"{selected.where}: column {column!r} has another value in each of its {labelled} rows (e.g."
-            f" {min(names)!r}): classes must repeat; a measurement is named with --values {column}:UNIT"
+            f"{table.path}: column {column!r} has another value in each of its {labelled} rows: a measurement is named"
+            f" with --values {column}:UNIT"
         )
-    if all(number_of(name) is not None for name in names):
-        classes = sorted(names, key=lambda name: (float(name), name))
-    else:
-        classes = sorted(names)
+    numbers = all(number_of(name) is not None for name in names)
+    classes = sorted(names, key=lambda name: (float(name), name)) if numbers else sorted(names)
     labels = {name: i for i, name in enumerate(classes)}
     return Task(name=column, classes=tuple(classes)), [labels.get(cell, -1) for cell in cells]
 
@@ -51,25 +70,20 @@ def element_of(name: str) -> tuple[str, int]:
     return (found[1], int(found[2])) if found else ("", 0)
 
 
-def with_elements(manifest: Manifest, names: Iterable[str]) -> Manifest:
-    """Return ``manifest`` with a column for each of ``names`` that is an element of a vector, e.g. state[2], from 0."""
-    made: dict[str, list[str]] = {}
+def with_elements(table: Manifest, names: Iterable[str]) -> Manifest:
+    """Return ``table`` with a column for each of ``names`` that is an element of a vector, e.g. state[2], from 0."""
+    rows = table.rows
     for name in names:
         vector, number = element_of(name)
-        if name in manifest.columns or vector not in manifest.columns:
+        if name in table.columns or vector not in table.columns:
             continue
-        cells = [[part.strip() for part in row.get(vector, "").strip("[]()").split(",")] for row in manifest.rows]
+        cells = [[part.strip() for part in row[vector].strip("[]()").split(",")] for row in rows]
         if number >= (longest := max(map(len, cells))):
-            raise ValueError(
-                f"{manifest.file}: {name} does not exist: {vector} has {longest} numbers, {vector}[0] to"
-                f" {vector}[{longest - 1}]"
-            )
-        found = (cell[number] if number < len(cell) else "" for cell in cells)
-        made[name] = ["" if text == "None" else text_of(text) for text in found]
-    if not made:
-        return manifest
-    rows = [{**row, **{name: cells[i] for name, cells in made.items()}} for i, row in enumerate(manifest.rows)]
-    return replace(manifest, columns=(*manifest.columns, *made), rows=rows)
+            raise ValueError(f"{table.path}: {name} does not exist: {vector} has {longest} numbers, counted from 0")
+        texts = (cell[number] if number < len(cell) else "" for cell in cells)
+        found = ["" if text == "None" else text_of(text) for text in texts]
+        rows = [{**row, name: text} for row, text in zip(rows, found, strict=True)]
+    return replace(table, rows=rows)
 
 
 def value_task(text: str) -> ValueTask:
@@ -85,7 +99,7 @@ def value_task(text: str) -> ValueTask:
 
 
 def read_values(
-    selected: Selection, tasks: Sequence[ValueTask], counts: Sequence[bool]
+    table: Manifest, tasks: Sequence[ValueTask], counts: Sequence[bool]
 ) -> tuple[dict[str, list[float]], list[list[int]]]:
     """Return the columns of numbers of ``tasks``, NaN where a cell is empty or its row does not count.
 
@@ -94,18 +108,17 @@ def read_values(
     columns: dict[str, list[float]] = {}
     for target in (target for task in tasks for target in task.targets):
         columns[target.name] = [math.nan] * len(counts)
-        for i, (row, counted) in enumerate(zip(selected.rows, counts, strict=True)):
+        for i, (row, counted) in enumerate(zip(table.rows, counts, strict=True)):
             if counted and (cell := row[target.name]):
                 value = number_of(cell)
                 if value is None:
                     raise ValueError(
-                        f"{selected.manifest.at(selected.numbers[i])}: {target.name} is {cell!r}: give a finite number in"
-                        f" {target.unit} without the unit, or leave the cell empty"
+                        f"{table.at(i)}: {target.name} is {cell!r}: give a finite number in {target.unit}, or nothing"
                     )
                 columns[target.name][i] = value
     for name, found in columns.items():
         if len({value for value in found if value == value}) < 2:  # NaN differs from itself
-            raise ValueError(f"{selected.where}: column {name!r} has fewer than two different values")
+            raise ValueError(f"{table.path}: column {name!r} has fewer than two different values")
     known = [
         [0 if any(not math.isnan(columns[t.name][i]) for t in task.targets) else -1 for i in range(len(counts))]
         for task in tasks
@@ -113,41 +126,36 @@ def read_values(
     return columns, known
 
 
-def check_names(where: str, names: Iterable[str], own: Collection[str]) -> None:
+def check_names(table: Manifest, names: Iterable[str], own: Collection[str]) -> None:
     """Raise ValueError if a column of numbers has one of the names that packing gives: it would replace that column."""
     for name in names:
         if name in own or name.startswith(("has_", "crc_", "bytes_")):
-            raise ValueError(
-                f"{where}: column {name!r} has the name of one of the pack itself: copy it to another name"
-            )
+            raise ValueError(f"{table.path}: column {name!r} has a name of the pack itself: copy it to another name")
 
 
 def read_controls(
-    selected: Selection, controls: dict[str, tuple[str, ...]], labels: Sequence[Sequence[int]]
+    table: Manifest, controls: dict[str, tuple[str, ...]], labels: Sequence[Sequence[int]]
 ) -> tuple[dict[str, list[float]], dict[str, tuple[str, ...]]]:
     """Return numeric pack columns for ``controls``, and the names of the columns that each control uses."""
-    labelled = [any(task[i] >= 0 for task in labels) for i in range(len(selected.rows))]
-    made = {c: _numeric(selected, c, labelled) for c in dict.fromkeys(c for given in controls.values() for c in given)}
+    labelled = [any(task[i] >= 0 for task in labels) for i in range(len(table.rows))]
+    made = {c: _numeric(table, c, labelled) for c in dict.fromkeys(c for given in controls.values() for c in given)}
     columns = {name: values for each in made.values() for name, values in each.items()}
     return columns, {name: tuple(c for column in given for c in made[column]) for name, given in controls.items()}
 
 
-def _numeric(selected: Selection, column: str, labelled: Sequence[bool]) -> dict[str, list[float]]:
+def _numeric(table: Manifest, column: str, labelled: Sequence[bool]) -> dict[str, list[float]]:
     """Return ``column`` as numbers, or one-hot columns if it holds text."""
-    cells = [row[column] for row in selected.rows]
-    empty = [n for n, cell, needed in zip(selected.numbers, cells, labelled, strict=True) if needed and not cell]
-    if empty:
-        raise ValueError(
-            f"{selected.where}: control column {column!r} is empty in {len(empty)} labelled rows, first row {empty[0]}"
-        )
+    cells = [row[column] for row in table.rows]
+    for i, cell in enumerate(cells):
+        if labelled[i] and not cell:
+            raise ValueError(f"{table.at(i)} is labelled, and control column {column!r} is empty")
     values = [number_of(cell) for cell in cells]
     if all(value is not None or not cell for value, cell in zip(values, cells, strict=True)):
         return {column: [value or 0.0 for value in values]}  # an empty cell is unlabelled, so never probed: any number
     names = sorted({cell for cell in cells if cell})
     if len(names) > MAX_ONE_HOT:
         raise ValueError(
-            f"{selected.where}: control column {column!r} has {len(names)} values that are not numbers, e.g."
-            f" {names[0]!r}: at most {MAX_ONE_HOT} become one-hot"
+            f"{table.path}: control column {column!r} has {len(names)} texts, e.g. {names[0]!r}: at most {MAX_ONE_HOT}"
         )
     return {f"{column}={name}": [float(cell == name) for cell in cells] for name in names}
 

@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 
 from mvitac.data.images import MAX_PIXELS
-from mvitac.datasets.table.image_refs import HDF5, Hdf5Row, ImageRef, open_hdf5
+from mvitac.datasets.table.image_refs import Hdf5Row, ImageRef, open_hdf5
 from mvitac.datasets.table.manifest import Manifest, text_of
-from mvitac.system.files import digest
 
 USUAL = ("vision", "touch", "left", "right", "background")
 """Names of image datasets that are found without being asked for."""
@@ -28,12 +27,6 @@ MAX_NUMBERS = 100_000_000
 MAX_TEXT = 200
 """Characters of the longest attribute that is a column. robomimic keeps whole simulator files in attributes."""
 Refs = dict[str, list[ImageRef | None]]
-
-
-def find_hdf5(path: Path) -> list[Path]:
-    """Return the HDF5 file ``path``, or those in this folder."""
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    return [file for file in files if file.suffix.lower() in HDF5 and file.is_file()]
 
 
 def read_hdf5(path: Path, files: Sequence[Path], images: Collection[str], vectors: Collection[str]) -> Manifest:
@@ -65,12 +58,8 @@ def read_hdf5(path: Path, files: Sequence[Path], images: Collection[str], vector
             seen = _seen(everything)
     if missing := [name for name in images if name not in found]:
         raise _no_images(path, missing, seen)
-    if not rows:
-        raise ValueError(f"{path}: the image datasets have no rows: is the recording empty?")
-    columns = tuple(name for name in dict.fromkeys(name for row in rows for name in row) if name not in left_out)
-    rows = [{name: row.get(name, "") for name in columns} for row in rows]
-    root, key = path if path.is_dir() else path.parent, digest([rows, sorted(found)])
-    return Manifest(path, root, columns, rows, key, found, group="demo", left_out=left_out)
+    rows = [{name: cell for name, cell in row.items() if name not in left_out} for row in rows]
+    return Manifest.of(path, rows, found, content=sorted(found), group="demo", left_out=left_out)
 
 
 def _datasets(group: Any) -> dict[str, Any]:

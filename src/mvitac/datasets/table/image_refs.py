@@ -1,14 +1,14 @@
-"""References to images: in a file, a video, a tar, a cell of a parquet table or a dataset of an HDF5 file.
+"""References to images: a file, a frame of a video, a member of a tar, a cell of a parquet table, a row of an HDF5 dataset.
 
-References with the same container (a video, a row group) are read together in one pass.
+References with the same container (a video, a row group) are read together in one pass. Another format is one more
+class here: its ``container``, how it is ``opened``, and one ``image`` of it.
 """
 
-import functools
 import io
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +26,14 @@ HDF5 = (".h5", ".hdf5")
 Damage = dict["ImageRef", str]  # reference of a damaged image -> what is wrong with it
 
 
-@dataclass(frozen=True, slots=True)
-class ImageRef(ABC):
-    """One image of a dataset; sorted and hashed by its location."""
+@dataclass(frozen=True, slots=True, order=True)
+class ImageRef:
+    """One image of a dataset, here a file of its own; sorted and hashed by its location."""
 
     path: str
+
+    def __str__(self) -> str:
+        return self.path
 
     def container(self) -> Hashable | None:
         """Return what is opened once to read many images from it; None if the image is read by itself."""
@@ -40,26 +43,26 @@ class ImageRef(ABC):
         """Return the bytes of the file that hold the image, if the table of rows does not determine them."""
         return ()
 
+    @contextmanager
+    def opened(self) -> Iterator[Any]:
+        """Open the container; ValueError or OSError if that fails."""
+        yield None
+
+    def image(self, container: Any) -> Image.Image:
+        """Read the image from the opened container as RGB; ValueError or OSError if it is damaged."""
+        return decode(self.path)
+
     @staticmethod
-    @abstractmethod
     def read(refs: "Sequence[ImageRef]", lost: Damage) -> "Iterator[tuple[ImageRef, Image.Image]]":
-        """Yield each reference with its image as RGB; damaged images go to ``lost`` instead.
-
-        ``refs`` are in ascending order, all of one class and with one container. ValueError or OSError if that cannot
-        be opened.
-        """
-
-
-@dataclass(frozen=True, slots=True, order=True)
-class File(ImageRef):
-    """An image file."""
-
-    def __str__(self) -> str:
-        return self.path
-
-    @staticmethod
-    def read(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
-        return _each(refs, lambda ref: decode(ref.path), lost)
+        """Yield the references, ascending and of one container, with their images; damaged ones go to ``lost`` instead."""
+        with refs[0].opened() as container:
+            for ref in refs:
+                try:
+                    found = ref.image(container)
+                except (ValueError, OSError) as error:
+                    lost[ref] = str(error)
+                else:
+                    yield ref, found
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -75,8 +78,8 @@ class Frame(ImageRef):
         return self.path
 
     @staticmethod
-    def read(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
-        path, at = refs[0].path, {ref.index: ref for ref in refs}  # type: ignore[attr-defined]
+    def read(refs: Sequence[Any], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
+        path, at = refs[0].path, {ref.index: ref for ref in refs}
         why: dict[int, str] = {}
         for index, image in video.frames(path, list(at), lost=why):
             yield at[index], Image.fromarray(image)
@@ -96,14 +99,10 @@ class TarMember(ImageRef):
     def within(self) -> tuple[int, ...]:
         return self.offset, self.size
 
-    @staticmethod
-    def read(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
-        def image(ref: Any) -> Image.Image:
-            with open(ref.path, "rb") as file:
-                file.seek(ref.offset)
-                return decode(io.BytesIO(file.read(ref.size)), str(ref))
-
-        return _each(refs, image, lost)
+    def image(self, container: Any) -> Image.Image:
+        with open(self.path, "rb") as file:
+            file.seek(self.offset)
+            return decode(io.BytesIO(file.read(self.size)), str(self))
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -120,28 +119,24 @@ class ParquetCell(ImageRef):
     def container(self) -> Hashable:
         return (self.path, self.group)
 
-    @staticmethod
-    def read(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
-        first: ParquetCell = refs[0]  # type: ignore[assignment]
+    @contextmanager
+    def opened(self) -> Iterator[pa.ChunkedArray]:
         try:
-            values = pq.ParquetFile(first.path).read_row_group(first.group, columns=[first.column]).column(0)
+            values = pq.ParquetFile(self.path).read_row_group(self.group, columns=[self.column]).column(0)
         except (pa.ArrowException, OSError) as error:
-            raise ValueError(f"{first.path} cannot be read ({brief(error)})") from None
+            raise ValueError(f"{self.path} cannot be read ({brief(error)})") from None
+        yield values
 
-        def image(ref: Any) -> Image.Image:
-            value = values[ref.row].as_py()
-            if isinstance(value, dict):
-                folder = Path(first.path).resolve().parent
-                beside = (
-                    folder / (value.get("path") or "")
-                ).resolve()  # of other folders, a stranger's table shows nothing
-                inside = beside.is_relative_to(folder) and beside.is_file()
-                value = value.get("bytes") or (beside.read_bytes() if inside else None)
-            if not value:
-                raise ValueError(f"{ref} holds no image")
-            return decode(io.BytesIO(value), str(ref))
-
-        yield from _each(refs, image, lost)
+    def image(self, container: pa.ChunkedArray) -> Image.Image:
+        value = container[self.row].as_py()
+        if isinstance(value, dict):
+            folder = Path(self.path).resolve().parent
+            beside = (folder / (value.get("path") or "")).resolve()
+            inside = beside.is_relative_to(folder) and beside.is_file()  # a stranger's table shows no other folders
+            value = value.get("bytes") or (beside.read_bytes() if inside else None)
+        if not value:
+            raise ValueError(f"{self} holds no image")
+        return decode(io.BytesIO(value), str(self))
 
 
 CHUNK_BYTES = 64 << 20
@@ -175,55 +170,34 @@ class Hdf5Row(ImageRef):
     def container(self) -> Hashable:
         return (self.path, self.dataset)
 
-    @staticmethod
-    def read(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
-        first: Hdf5Row = refs[0]  # type: ignore[assignment]
-        with open_hdf5(first.path) as file:
-            images = file[first.dataset]
+    @contextmanager
+    def opened(self) -> Iterator[Any]:
+        with open_hdf5(self.path) as file:
+            yield file[self.dataset]
 
-            def image(ref: Any) -> Image.Image:
-                try:
-                    pixels = images[ref.index]
-                except (OSError, RuntimeError, IndexError) as error:
-                    raise ValueError(f"{ref} cannot be read ({brief(error)})") from None
-                return Image.fromarray(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels).convert("RGB")
-
-            yield from _each(refs, image, lost)
-
-
-def _each(
-    refs: Sequence[ImageRef], image: Callable[[Any], Image.Image], lost: Damage
-) -> Iterator[tuple[ImageRef, Image.Image]]:
-    """Yield each reference with its ``image``; damaged ones are put in ``lost``."""
-    for ref in refs:
+    def image(self, container: Any) -> Image.Image:
         try:
-            found = image(ref)
-        except (ValueError, OSError) as error:
-            lost[ref] = str(error)
-        else:
-            yield ref, found
+            pixels = container[self.index]
+        except (OSError, RuntimeError, IndexError) as error:
+            raise ValueError(f"{self} cannot be read ({brief(error)})") from None
+        return Image.fromarray(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels).convert("RGB")
 
 
 def read_all(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
     """Yield each distinct reference, all of one container, with its image (RGB); damaged ones are put in ``lost``."""
-    distinct = sorted(set(refs))  # type: ignore[type-var]
-    if distinct:
-        yield from type(distinct[0]).read(distinct, lost)
+    if distinct := sorted(set(refs)):
+        yield from distinct[0].read(distinct, lost)
 
 
-@functools.lru_cache(maxsize=64)
+@lru_cache(maxsize=64)
 def mean_image(refs: tuple[ImageRef, ...]) -> np.ndarray:
     """Return the mean of images of one size, uint8 [H, W, 3]: the sensor's background."""
-    total, num = None, 0
+    images: list[np.ndarray] = []
     for ref in refs:
         lost: Damage = {}
-        for _, read in read_all([ref], lost):
-            image = np.asarray(read)
-            if total is not None and image.shape != total.shape:
-                raise ValueError(f"{ref} is {image.shape[1]} x {image.shape[0]}: backgrounds must be of one size")
-            total = image.astype(np.float64) if total is None else total + image
-            num += 1
+        images += [np.asarray(image) for _, image in read_all([ref], lost)]
         if lost:
             raise ValueError(lost[ref])
-    assert total is not None
-    return np.rint(total / num).astype(np.uint8)
+        if images[-1].shape != images[0].shape:
+            raise ValueError(f"{ref} has another size than {refs[0]}: backgrounds must be of one size")
+    return np.rint(np.mean(images, axis=0, dtype=np.float64)).astype(np.uint8)

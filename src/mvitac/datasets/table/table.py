@@ -19,11 +19,11 @@ from mvitac.data.source import Lost, Sample, Source, one_stamp
 from mvitac.data.spec import AnyTask, DataSpec
 from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.datasets.table import columns, image_columns, splits
-from mvitac.datasets.table.columns import Grouping, value_task
-from mvitac.datasets.table.image_columns import Background, Refs, Selection
-from mvitac.datasets.table.manifest import Condition, Manifest
+from mvitac.datasets.table.columns import Condition, all_hold, value_task
+from mvitac.datasets.table.image_columns import Background
+from mvitac.datasets.table.manifest import Manifest
 from mvitac.datasets.table.read_rows import Row, bundles, read_rows
-from mvitac.datasets.table.splits import BY_GROUP, group_by_video
+from mvitac.datasets.table.splits import BY_GROUP
 from mvitac.registry import check_range, to_json
 from mvitac.system.files import digest
 
@@ -103,8 +103,7 @@ class RowsConfig(DatasetConfig, ABC):
             raise ValueError("background and no_contact: give only one of them, a touch has one background")
         if (self.background or self.no_contact) and not self.difference:
             raise ValueError("a background is only used with subtract-background: add that option, or leave this out")
-        for text in (*self.only, *self.label_only, *self.no_contact):
-            Condition.parse(text)
+        self.conditioned()
         if len(self.touch) > 2:
             raise ValueError(f"touch {' '.join(self.touch)}: give one column, or two to stack (left right)")
         named = Counter([*self.touch, *([self.vision] if self.vision else [])])
@@ -135,6 +134,10 @@ class RowsConfig(DatasetConfig, ABC):
         named = [target.name for text in self.values for target in value_task(text).targets]
         return [*named, *(column for used in self.control_columns().values() for column in used)]
 
+    def conditioned(self) -> list[str]:
+        """Return the columns that the conditions name."""
+        return [Condition.parse(text).column for text in (*self.only, *self.label_only, *self.no_contact)]
+
     def vectors(self) -> set[str]:
         """Return the columns of lists of numbers of which an element is named, such as state of state[2]."""
         return {columns.element_of(name)[0] for name in self.numbers()} - {""}
@@ -153,43 +156,43 @@ class Rows(Source):
     sizes_at = "file_sizes"
 
     def __init__(self, config: RowsConfig) -> None:
-        manifest = columns.with_elements(config.manifest(), config.numbers())
         self._config = config
-        self._manifest_digest = manifest.digest
         self._title = config.title or (config.path if config.path.is_dir() else config.path.parent).resolve().name
-        self._vision, self._touch = image_columns.find(manifest, config.vision, config.touch)
-        manifest = manifest.normalised({self._vision, *self._touch, *(config.background or ("background",))})
-        self._group = config.group or ("group" if "group" in manifest.columns else manifest.group)
-        self._split = config.split or ("split" if "split" in manifest.columns else BY_GROUP)
-        self._sensor = config.sensor or ("sensor" if "sensor" in manifest.columns else None)
-        label_columns = config.labels or manifest.labels
+        table = columns.with_elements(config.manifest(), config.numbers())
+        self._digest = table.digest
+        self._vision, self._touch = image_columns.find(table, config.vision, config.touch)
+        self._images = tuple(column for column in (self._vision, *self._touch) if column)
+        self._group = config.group or ("group" if "group" in table.columns else table.group)
+        self._split = config.split or ("split" if "split" in table.columns else BY_GROUP)
+        self._sensor = config.sensor or ("sensor" if "sensor" in table.columns else None)
+        label_columns = config.labels or table.labels
         value_tasks = [value_task(text) for text in config.values]
         targets = [target.name for task in value_tasks for target in task.targets]
-        label_conditions = [Condition.parse(text) for text in config.label_only]
-        _check_columns(config, manifest, [*label_columns, *targets, self._group, self._split, self._sensor])
+        split = None if self._split == BY_GROUP else self._split
+        table.check(*label_columns, *targets, self._group, split, self._sensor, config.touch_group)
+        table.check(*config.conditioned(), *(c for used in config.control_columns().values() for c in used))
 
-        selected = self._select(manifest)
-        asked = {"vision": [self._vision] if self._vision else [], "touch": self._touch}
-        missing = image_columns.check_present(selected, asked, config.allow_missing)
-        self._sizes, stamps = image_columns.check_files(selected)
+        table, grounds = self._select(table)
+        asked = {"vision": self._images[: bool(self._vision)], "touch": self._touch}
+        missing = image_columns.check_present(table, asked, config.allow_missing)
+        self._sizes, stamps = image_columns.check_files(table, self._images, grounds)
 
-        grouping = self._grouping(selected)
-        counts = [all(condition.holds(row) for condition in label_conditions) for row in selected.rows]
-        read = [columns.read_task(selected, column, counts) for column in label_columns]
-        values, measured = columns.read_values(selected, value_tasks, counts)
+        group_by, groups = self._grouping(table)
+        touch_groups = table.filled(config.touch_group, "touch_group") if config.touch_group else groups
+        counts = all_hold(config.label_only, table)
+        read = [columns.read_task(table, column, counts) for column in label_columns]
+        values, measured = columns.read_values(table, value_tasks, counts)
         tasks, labels = [*(task for task, _ in read), *value_tasks], [*(label for _, label in read), *measured]
-        assigned = self._assign(selected, grouping, tasks, labels)
-        extra, controls = columns.read_controls(selected, config.control_columns(), labels)
+        assigned = self._assign(table, {f"groups ({group_by})": groups, "touch groups": touch_groups}, tasks, labels)
+        extra, controls = columns.read_controls(table, config.control_columns(), labels)
 
-        own: dict[str, Sequence[Any]] = {"id": selected.ids(), "group": grouping.groups}
-        own |= {"touch_group": grouping.touch_groups, "split": assigned}
-        own |= {f"label_{task.name}": label for task, label in read}
-        columns.check_names(selected.where, [*values, *extra], {*own, "sensor"})
+        own: dict[str, Sequence[Any]] = {"id": table.ids(), "group": groups, "touch_group": touch_groups}
+        own |= {"split": assigned, **{f"label_{task.name}": label for task, label in read}}
+        columns.check_names(table, [*values, *extra], {*own, "sensor"})
         own |= values | {f"has_{m}": [not lacks for lacks in lacking] for m, lacking in missing.items()}
-        self._rows = self._make_rows(selected, own, extra)
+        self._rows = self._make_rows(table, grounds, own, extra)
 
-        row_bytes = 3 * config.size**2 * sum(bool(column) for column in (self._vision, *self._touch))
-        self._items = bundles(self._rows, max(1, min(MAX_TOGETHER, MAX_TOGETHER_BYTES // row_bytes)))
+        self._items = bundles(self._rows, max(1, min(MAX_TOGETHER, MAX_TOGETHER_BYTES // self._row_bytes())))
         used = [[ref for i in item for ref in self._rows[i].refs()] for item in self._items]
         self._stamps = [one_stamp((*stamps[ref.path], *ref.within()) for ref in refs) for refs in used]
         self._spec = DataSpec(
@@ -198,106 +201,102 @@ class Rows(Source):
             touch_channels=3 * len(self._touch),
             tasks=tuple(task for task, _ in read),
             values=tuple(value_tasks),
-            group_by=grouping.group_by,
+            group_by=group_by,
             controls=controls,
             licence=config.licence,
             source=config.source_url or "not given",
-            notes=self._notes(selected, grouping, assigned, {task.name: label for task, label in read}),
+            notes=self._notes(table, group_by, assigned, {task.name: label for task, label in read}),
             difference=config.difference,
         )
 
-    def _select(self, manifest: Manifest) -> Selection:
-        """Apply the row conditions and find each row's images and backgrounds."""
-        config, rows = self._config, manifest.rows
-        only, no_contact = ([Condition.parse(t) for t in texts] for texts in (config.only, config.no_contact))
-        kept = [i for i, row in enumerate(rows) if all(condition.holds(row) for condition in only)]
-        if not kept:
-            raise ValueError(f"{manifest.file}: none of {len(rows)} rows meets {' and '.join(config.only)}")
-        refs: Refs = {column: manifest.refs(column) for column in (self._vision, *self._touch) if column}
-        backgrounds: list[Background] = []
-        if config.difference and no_contact:
-            backgrounds = image_columns.backgrounds_from_rows(
-                manifest, refs, self._touch, kept, self._sensor, no_contact
-            )
-        elif config.difference:
-            backgrounds = image_columns.backgrounds_from_columns(manifest, refs, self._touch, kept, config.background)
-        if no_contact:
-            kept = [i for i in kept if not all(condition.holds(rows[i]) for condition in no_contact)]
-            if not kept:
-                raise ValueError(f"{manifest.file}: every row meets {' and '.join(config.no_contact)}: no samples left")
-        return Selection(
-            manifest=manifest,
-            numbers=[i + 1 for i in kept],
-            rows=[rows[i] for i in kept],
-            refs={column: [found[i] for i in kept] for column, found in refs.items()},
-            backgrounds=backgrounds,
-        )
+    def _row_bytes(self) -> int:
+        return 3 * self._config.size**2 * len(self._images)
 
-    def _grouping(self, selected: Selection) -> Grouping:
+    def _select(self, table: Manifest) -> tuple[Manifest, list[Background]]:
+        """Return the rows that become samples with their images, and the background of each (none for raw images)."""
+        config = self._config
+        backgrounds = (config.background or ("background",)) if config.difference and not config.no_contact else ()
+        table.check(*backgrounds)
+        paths = {*self._images, *(config.background or ("background",))}
+        table = table.resolved((*self._images, *backgrounds), paths)
+        table = table.kept(all_hold(config.only, table), f"no row meets {' and '.join(config.only)}")
+        if not config.no_contact and not config.difference:
+            return table, []
+        empty = all_hold(config.no_contact, table) if config.no_contact else None
+        grounds = image_columns.backgrounds(table, self._touch, config.background, self._sensor, empty)
+        if empty is None:
+            return table, grounds
+        kept = [not none for none in empty]
+        grounds = [ground for ground, keep in zip(grounds, kept, strict=True) if keep]
+        return table.kept(kept, f"every row meets {' and '.join(config.no_contact)}"), grounds
+
+    def _grouping(self, table: Manifest) -> tuple[str, list[str]]:
+        """Return what a group is, and the group of each row."""
         if self._group:
-            group_by, groups = self._group, selected.filled(self._group, "group")
-        else:
-            group_by, groups = group_by_video(selected.manifest.root, selected.numbers, selected.refs.values())
-        touch_group = self._config.touch_group
-        touch_groups = selected.filled(touch_group, "touch_group") if touch_group else groups
-        shared = touch_group or group_by
-        return Grouping(groups=groups, group_by=group_by, touch_groups=touch_groups, touch_group_by=shared)
+            return self._group, table.filled(self._group, "group")
+        return splits.group_by_video(table.root, table.numbers, [table.images[column] for column in self._images])
 
     def _assign(
-        self, selected: Selection, grouping: Grouping, tasks: Sequence[AnyTask], labels: Sequence[Sequence[int]]
+        self,
+        table: Manifest,
+        whole: dict[str, list[str]],
+        tasks: Sequence[AnyTask],
+        labels: Sequence[Sequence[int]],
     ) -> list[str]:
-        """Return the split of each row: read from its column, or assigned by group, and checked."""
-        config, column, where = self._config, self._split, selected.where
+        """Return the split of each row, from its column or assigned by group; those of one ``whole`` are in one."""
+        config, column, where = self._config, self._split, str(table.path)
+        groups = next(iter(whole.values()))
         if column == BY_GROUP:
-            shares = config.test_share, config.val_share
-            found = splits.assign_splits(grouping.groups, labels, *shares, config.split_seed)
+            found = splits.assign_splits(groups, labels, config.test_share, config.val_share, config.split_seed)
         else:
-            found = selected.filled(column, "split")
-            splits.check_split_names(where, column, selected.numbers, found)
+            found = table.filled(column, "split")
+            splits.check_split_names(where, column, table.numbers, found)
         if not config.allow_leak:
-            splits.check_leak(where, column, f"groups ({grouping.group_by})", grouping.groups, found)
-            touches = f"touch groups ({grouping.touch_group_by})"
-            splits.check_leak(where, column, touches, grouping.touch_groups, found)
-            for name, refs in selected.refs.items():
-                there = [i for i, ref in enumerate(refs) if ref]
-                images = [os.path.normpath(str(refs[i])) for i in there]
-                splits.check_leak(where, column, f"{name} images", images, [found[i] for i in there])
-        splits.check_sides(where, column, found, tasks, labels, len(set(grouping.groups)))
+            for what, names in whole.items():
+                splits.check_leak(where, column, what, names, found)
+            for name in self._images:
+                there = [(ref, side) for ref, side in zip(table.images[name], found, strict=True) if ref]
+                images = [os.path.normpath(str(ref)) for ref, _ in there]
+                splits.check_leak(where, column, f"{name} images", images, [side for _, side in there])
+        splits.check_sides(where, column, found, tasks, labels, len(set(groups)))
         return found
 
     def _notes(
-        self, selected: Selection, grouping: Grouping, assigned: Sequence[str], labels: dict[str, list[int]]
+        self, table: Manifest, group_by: str, assigned: Sequence[str], labels: dict[str, list[int]]
     ) -> tuple[str, ...]:
         """What results say about groups that no column names."""
-        if grouping.group_by == "video":
+        if group_by == "video":
             return ("no column says the groups, so frames of one video are one group",)
-        if grouping.group_by != "row":
+        if group_by != "row":
             return ()
-        names = [name for name in selected.manifest.columns if name not in (*labels, self._split, self._sensor)]
-        texts = {name: [row[name] for row in selected.rows] for name in names if name not in selected.refs}
-        for column, refs in selected.refs.items():  # file names up to their last number
-            files = (os.path.splitext(os.path.basename(ref.path))[0] if ref else "" for ref in refs)
+        known = {*labels, self._split, self._sensor, *self._images}
+        texts = {name: [row[name] for row in table.rows] for name in table.rows[0] if name not in known}
+        for column in self._images:  # file names up to their last number
+            files = (os.path.splitext(os.path.basename(ref.path))[0] if ref else "" for ref in table.images[column])
             if (stems := [re.sub(r"\d+\D*$", "", file) for file in files]) not in texts.values():
                 texts[f"{column} files"] = stems
         return (columns.ungrouped(texts, assigned, [*labels.values()]),)
 
     def _make_rows(
-        self, selected: Selection, own: dict[str, Sequence[Any]], extra: dict[str, list[float]]
+        self,
+        table: Manifest,
+        grounds: Sequence[Background],
+        own: dict[str, Sequence[Any]],
+        extra: dict[str, list[float]],
     ) -> list[Row]:
         """Combine the pack's ``own`` columns, the manifest's other columns and the controls' numbers (``extra``)."""
         if self._sensor:
-            own["sensor"] = [row[self._sensor] for row in selected.rows]
+            own["sensor"] = [row[self._sensor] for row in table.rows]
         # Which modalities a row has is checked, not read; column order is part of the pack's digest.
-        known = {*own, *selected.refs, "has_vision", "has_touch"}
+        known = {*own, *self._images, "has_vision", "has_touch"}
         rows = []
-        for i, (number, cells) in enumerate(zip(selected.numbers, selected.rows, strict=True)):
+        for i, (number, cells) in enumerate(zip(table.numbers, table.rows, strict=True)):
             row = {name: values[i] for name, values in own.items()}
             row |= {name: cell for name, cell in cells.items() if name not in known}
             row |= {name: values[i] for name, values in extra.items()}
-            touch = tuple(ref for c in self._touch if (ref := selected.refs[c][i]))
-            background = tuple(b[number] for b in selected.backgrounds) if touch else ()
-            vision = selected.refs[self._vision][i] if self._vision else None
-            rows.append(Row(number, vision, touch, background, row))
+            touch = tuple(ref for column in self._touch if (ref := table.images[column][i]))
+            vision = table.images[self._vision][i] if self._vision else None
+            rows.append(Row(number, vision, touch, grounds[i] if grounds and touch else (), row))
         return rows
 
     def spec(self) -> DataSpec:
@@ -314,7 +313,7 @@ class Rows(Source):
         return {
             "reader": f"{self._config.name} {VERSION}",
             "title": self._title,
-            "manifest": self._manifest_digest,
+            "manifest": self._digest,
             "file_sizes": digest(self._sizes),
             "options": {k: v for k, v in to_json(self._config).items() if k not in ("path", *KEEPING)},
         }
@@ -324,12 +323,3 @@ class Rows(Source):
 
     def read(self, item: int) -> list[Sample | Lost]:
         return read_rows([self._rows[i] for i in self._items[item]], self._config.size)
-
-
-def _check_columns(config: RowsConfig, manifest: Manifest, chosen: Sequence[str | None]) -> None:
-    """Raise ValueError unless every column that an option names exists."""
-    texts = (*config.only, *config.label_only, *config.no_contact)
-    asked = [*chosen, config.touch_group, *(Condition.parse(text).column for text in texts)]
-    for column in (*asked, *(c for used in config.control_columns().values() for c in used)):
-        if column is not None and column != BY_GROUP:
-            manifest.check(column)
