@@ -53,7 +53,7 @@ def backgrounds(
         return [tuple((ref,) if (ref := found[c][i]) else () for c in columns) for i in range(len(table.rows))]
     names = [row[sensor] if sensor else "" for row in table.rows]
     known: dict[str, Background] = {}
-    for name in set(names):
+    for name in dict.fromkeys(names):
         rows = [i for i in range(len(names)) if empty[i] and names[i] == name]
         known[name] = tuple(tuple(r for i in rows if (r := table.images[c][i]))[:NUM_NO_CONTACT] for c in touch)
         if not all(known[name]):
