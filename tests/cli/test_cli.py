@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from mvitac.cli.main import COMMANDS, HELP, main
+from mvitac.run import Run
 
 
 def test_help_imports_nothing_heavy() -> None:
@@ -77,7 +78,7 @@ def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
 ) -> None:
     small = "--data.num 240 --data.touches 2 --data.size 32 --data.workers 1 --augment.size 32 --augment.whole 32"
     tiny = "--encoder.trunk mvitac_tiny --steps 2 --batch-size 16 --precision fp32"
-    command = f"demo --out {tmp_path / 'demo'} --seeds 2 {small} {tiny}".split()
+    command = f"demo --recipe quick --out {tmp_path / 'demo'} --seeds 2 {small} {tiny}".split()
     assert main(command) == 0
     summary = json.loads((tmp_path / "demo" / "summary.json").read_text())
     for modality in ("touch", "vision", "both"):
@@ -100,3 +101,14 @@ def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
     assert main(command) == 0
     assert weights.stat().st_mtime_ns == before
     assert json.loads((tmp_path / "demo" / "summary.json").read_text()) == summary
+
+
+@pytest.mark.parametrize(("there", "expected"), [("package", "locked"), ("", "quick")])
+def test_the_demo_starts_from_imagenet_where_its_weights_are(
+    there: str, expected: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made: list[Run] = []
+    monkeypatch.setattr("mvitac.cli.demo.imagenet.source", lambda trunk: there)
+    monkeypatch.setattr("mvitac.cli.demo.run_demo", lambda run, *_: made.append(run))
+    assert main(["demo"]) == 0
+    assert made[0].recipe == expected and ("from scratch" in capsys.readouterr().out) != bool(there)
