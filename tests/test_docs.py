@@ -1,7 +1,5 @@
 """The docs: what a page names is there, its commands have these options, and nothing stands twice."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from dataclasses import fields

@@ -1,7 +1,5 @@
 """benchmarks/gpu.sh: a rehearsal on a CPU, its time limit, and the tables that it fills."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

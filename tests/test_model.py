@@ -1,7 +1,5 @@
 """What is saved is what is loaded, and embed() sees what the probe saw."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The recipes are what the paper and the released code say, and every run survives its own record."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 So do the how-to pages docs/add_a_dataset.md, and docs/encoders.md and policies.md on the files that a tutorial leaves.
 """
 
-from __future__ import annotations
-
 import csv
 import os
 import shlex

@@ -1,7 +1,5 @@
 """The bench: one protocol for any encoder, results that cannot be changed unseen, and a page that compares them."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

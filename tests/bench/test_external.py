@@ -1,7 +1,5 @@
 """Adapters to other people's encoders: small weights with their names give what their networks are by definition."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

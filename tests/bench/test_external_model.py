@@ -1,7 +1,5 @@
 """External encoders as models: the same features as ours for the same network, and data of any layout."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from collections.abc import Callable

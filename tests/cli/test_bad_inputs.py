@@ -6,8 +6,6 @@ command stand for the test's own folder, a good pack, a good finished run (copie
 spoilt) and a free place for output.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib

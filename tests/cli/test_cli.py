@@ -1,7 +1,5 @@
 """The command line: quick to answer, a help that is a golden file, and the whole road in one process."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The stored help of each command is what the command says of itself, and it is printed at once."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import os

@@ -1,7 +1,5 @@
 """What is published is what is loaded; anything else in its place is refused before it can do harm."""
 
-from __future__ import annotations
-
 import shutil
 from copy import copy as copied
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Probes of values after publishing: in the artifact, its card, ``Model.predict`` and exports."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A model of windows in use: clips for ``embed`` and ``predict``, its artifact, its export, and live by time stamps."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """An export is the trained model, or there is none: parity on real inputs, and every way to get it wrong is named."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -4,8 +4,6 @@ While a command runs, every path and network address that Python touches is reco
 trap, a folder that only the artifact names, and none may be on the network.
 """
 
-from __future__ import annotations
-
 import json
 import pickle
 import shutil

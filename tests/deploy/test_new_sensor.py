@@ -1,7 +1,5 @@
 """An export for a touch sensor that the model never met: in live, its answers are those of the probe in known colours."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The encoders inside a policy, and the ROS 2 node on a fake publisher."""
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import replace

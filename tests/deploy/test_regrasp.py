@@ -1,7 +1,5 @@
 """The re-grasping example: what is lifted, by arithmetic; and the whole of it on grasps that only touch can tell apart."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The encoders as a scikit-learn transformer."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Search is exact; what is embedded is what the model gives; both directions find their pair."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

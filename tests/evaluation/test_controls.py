@@ -1,7 +1,5 @@
 """The parts that controls and probes are made of, against arithmetic."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """What an owner says that weights were trained on is stated, and compared with the names of the data that is scored."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

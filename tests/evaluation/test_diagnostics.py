@@ -1,7 +1,5 @@
 """The collapse panel on cases whose answer is known."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

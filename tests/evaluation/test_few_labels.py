@@ -1,7 +1,5 @@
 """Few labels: the linear probe on a share of the labelled rows."""
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Probes: they find what is there, choose nothing on test, and their intervals are what they say."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import re

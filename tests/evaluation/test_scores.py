@@ -1,7 +1,5 @@
 """Intervals and differences: worked cases, and their error rates over many simulated pairs of equal methods."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from benchmarks.calibration import rates_of_error, value_rates_of_error

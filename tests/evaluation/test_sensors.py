@@ -1,7 +1,5 @@
 """Sensors in probes: statistics from unlabelled images, colours of known sensors, what features tell of the sensor."""
 
-from __future__ import annotations
-
 import copy
 import json
 from dataclasses import replace

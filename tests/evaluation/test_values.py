@@ -1,7 +1,5 @@
 """Tasks with values: numbers in the table, ridge probes, and scores in the unit."""
 
-from __future__ import annotations
-
 import copy
 import csv
 import json

@@ -1,7 +1,5 @@
 """Live on a fake clock: contact, smoothing, ages, and every fault named and survived."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

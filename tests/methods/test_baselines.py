@@ -1,7 +1,5 @@
 """The baselines against their owners' formulas, written out one element at a time."""
 
-from __future__ import annotations
-
 import copy
 import math
 from dataclasses import replace

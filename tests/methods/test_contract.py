@@ -1,7 +1,5 @@
 """What every registered method owes the loop: a finite pure forward, gradients, frozen keys, a record, an exact resume."""
 
-from __future__ import annotations
-
 import copy
 import json
 import typing

@@ -1,7 +1,5 @@
 """Fine-tuning as a method: heads alone or all, shares of the labels, exact resumes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

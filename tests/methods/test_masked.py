@@ -1,7 +1,5 @@
 """MAE and I-JEPA against their papers' arithmetic, written out patch by patch, on a tiny ViT with 4 x 4 patches."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace

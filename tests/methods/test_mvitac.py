@@ -1,7 +1,5 @@
 """The method against the paper: eq. 1-14 written out slowly, and what may and may not be trained."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 from typing import Any

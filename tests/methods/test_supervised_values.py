@@ -1,7 +1,5 @@
 """The supervised methods on tasks with values: standardised targets, missing values, scores in the unit."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Weights are what was asked for, or an error: never a silent fallback."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import socket

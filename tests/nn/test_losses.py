@@ -1,7 +1,5 @@
 """InfoNCE against closed forms and against a slow transcription of eq. 8."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Convolutions over small maps as products: the same values and gradients, and the convolution where it must stay."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 import torch.nn.functional as F

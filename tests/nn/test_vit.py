@@ -1,7 +1,5 @@
 """ViTs of any size, with a part of their patches, and the random numbers that choose it."""
 
-from __future__ import annotations
-
 import pytest
 import timm
 import torch

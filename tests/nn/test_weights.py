@@ -1,7 +1,5 @@
 """Other people's weights are loaded whole or refused: what is scored is never a random network under their name."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

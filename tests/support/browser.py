@@ -1,7 +1,5 @@
 """A headless Chromium, driven through its debugging pipe: no driver, no port, nothing to install beside the browser."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

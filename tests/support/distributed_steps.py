@@ -1,7 +1,5 @@
 """What one process and each of two do alike: the runs, their methods, three steps, and the third step resumed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The scripts in examples/ and benchmarks/, imported from their files."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Live input on a fake clock: a robot that touches every three seconds, and something that breaks every minute."""
 
-from __future__ import annotations
-
 import os
 import tracemalloc
 from collections import Counter

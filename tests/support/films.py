@@ -1,7 +1,5 @@
 """Videos whose every frame is known: frame i is one gray, far from that of its neighbours."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

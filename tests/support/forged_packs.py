@@ -1,7 +1,5 @@
 """Packs changed behind the library's back, with digests that agree with the change."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Packs to mix: the stripes cut in two, and one with touch alone, at another size, with classes numbered otherwise."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any

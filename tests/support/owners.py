@@ -3,8 +3,6 @@
 The networks are written from the owners' names and shapes, with loops and without the code under test.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Figures of an HTML page."""
 
-from __future__ import annotations
-
 import re
 from base64 import b64decode
 

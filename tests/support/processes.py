@@ -1,7 +1,5 @@
 """Processes for tests that kill or connect them. Forked from one that has imported torch, they start at once."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import sys

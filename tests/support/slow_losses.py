@@ -1,7 +1,5 @@
 """InfoNCE written out as the paper has it."""
 
-from __future__ import annotations
-
 import math
 
 import torch

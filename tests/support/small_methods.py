@@ -1,7 +1,5 @@
 """Every method on a tiny trunk with narrow heads, a batch of noise for it, and its losses on that batch."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

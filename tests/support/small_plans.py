@@ -1,7 +1,5 @@
 """A plan of three rows and two seeds, four steps each, on the striped pairs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from mvitac.data.pack import Pack

@@ -1,7 +1,5 @@
 """A run, its method and a batch for single training steps; a batch in chunks; gradients, and tensors compared."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

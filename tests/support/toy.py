@@ -3,8 +3,6 @@
 The three patterns (columns, rows, checks) stay themselves under a horizontal flip.
 """
 
-from __future__ import annotations
-
 import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path

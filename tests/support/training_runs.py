@@ -1,7 +1,5 @@
 """Short runs on the striped pairs: the smoke recipe, training that dies on the way, weights compared bit for bit."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Videos whose every frame says which it is: its number in black and white blocks, its stream in a band of colour."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Imported once by the server that forks processes of tests, so that none of them loads networks anew."""
 
-from __future__ import annotations
-
 import gc
 
 import torch

@@ -1,7 +1,5 @@
 """What one process of test_distributed.py does: main("step", DIR), main("train", DATA, OUT, DIE_AFTER, METHOD)."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

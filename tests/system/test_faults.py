@@ -1,7 +1,5 @@
 """Small parts of ``benchmarks/faults.py`` and ``benchmarks/fuzz.py``: kills, single flipped bits, odd options."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """New folders: made by one process at a time, complete or not at all."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """What `--precision auto` becomes, what is said and kept of it, and that a CPU without bf16 trains in fp32."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

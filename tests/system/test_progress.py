@@ -1,7 +1,5 @@
 """What long work says of itself: bars with the time left on a terminal, a line now and then in a pipe, nothing unasked."""
 
-from __future__ import annotations
-
 import io
 import sys
 

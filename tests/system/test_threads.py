@@ -1,7 +1,5 @@
 """Work side by side: the order, the errors and the threads of `in_threads`, and that probes do not depend on it."""
 
-from __future__ import annotations
-
 import shutil
 import threading
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Training on several packs: what is drawn, that a stop changes nothing, and losses of rows that lack a modality."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -249,11 +247,3 @@ def test_a_run_on_a_mix_is_probed_by_task(parts: dict[str, str], tmp_path: Path)
     assert {(r["modality"], r["num_test"]) for r in records if r["task"] == "pattern"} >= {("both", num[0])}
     assert not result["leaks"]
     assert main(["report", str(out), "--out", str(tmp_path / "report.html")]) == 0
-
-
-def test_the_verdict_on_a_mix_tells_the_tasks_of_each_part(parts: dict[str, str], tmp_path: Path) -> None:
-    built(Slice(num=96, first=72), tmp_path / "large")
-    run = mix_run(parts["a"], f"large={tmp_path / 'large'}", steps=2)
-    log = (train(run, tmp_path / "r", quiet=True) / "log.jsonl").read_text().splitlines()
-    said = json.loads(log[-1])["verdict"]
-    assert all(f"{part} {m}/pattern " in said for part in ("a", "large") for m in ("touch", "vision"))

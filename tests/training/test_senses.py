@@ -1,7 +1,5 @@
 """A network of its own for each sense, locked or not: training, resuming, momentum copies, probes, export, loading."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,21 +48,18 @@ def started(pack: Pack, file: Path, **vision: object) -> Run:
     return smoke(pack, encoder=encoder, augment=SIZES, method=method, steps=4, eval_every=0, checkpoint_every=2)
 
 
-@pytest.mark.parametrize("locked", [False, True])
-def test_from_training_to_the_exported_model(pack: Pack, file: Path, tmp_path: Path, locked: bool) -> None:
-    run = started(pack, file, locked=locked)
+def test_from_training_to_the_exported_model(pack: Pack, file: Path, tmp_path: Path) -> None:
+    run = started(pack, file)
     train(run, tmp_path / "straight", quiet=True)
     with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
         train(run, tmp_path / "cut", quiet=True)
     train(run, tmp_path / "cut", resume=True, quiet=True)
     assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
     trained, start = weights(tmp_path / "cut"), build_trunk(run.encoder.vision, 3).state_dict()
-    same = [torch.equal(trained[f"encoders.vision.{name}"], value) for name, value in start.items()]
-    assert all(same) if locked else not any(same)
+    assert not any(torch.equal(trained[f"encoders.vision.{name}"], value) for name, value in start.items())
 
     model = mvitac.load(tmp_path / "cut")
     assert "vision test_resnet.r160_in1k, touch mvitac_tiny" in repr(model)
-    assert all(p.requires_grad for p in model.parameters())  # a loaded model can be trained further
     images = {m: pack.images[m][:5].copy() for m in ("vision", "touch")}
     features = model.embed(**images)
     assert {m: tuple(z.shape) for m, z in features.items()} == {"vision": (5, 96), "touch": (5, 64)}
@@ -100,6 +95,7 @@ def test_every_method_trains_two_networks_and_leaves_a_locked_one(
     for parameter, value in build_trunk(run.encoder.vision, 3).state_dict().items():
         inner = "trunks.0." if name == "calandra" else ""
         assert torch.equal(trained[f"encoders.vision.{inner}{parameter}"], value), parameter
+    assert all(p.requires_grad for p in mvitac.load(tmp_path / "run").parameters())  # it can be trained further
 
 
 @pytest.mark.parametrize("name", ["mae", "ijepa"])
@@ -114,7 +110,7 @@ def test_masked_methods_read_tokens_of_another_width_and_grid(pack: Pack, tmp_pa
     assert {m: e.num_features for m, e in model.encoders.items()} == {"vision": 192, "touch": 64}
 
 
-@pytest.mark.parametrize("name", ["mvitac", "simclr", "supervised", "byol"])
+@pytest.mark.parametrize("name", ["mvitac", "supervised"])
 def test_a_locked_trunk_sees_each_whole_image_once(
     pack: Pack, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:

@@ -1,7 +1,5 @@
 """Start weights from another model: what is taken, what is recorded, and what the new run inherits of leaks."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

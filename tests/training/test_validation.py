@@ -1,7 +1,5 @@
 """Validation while training: the start is the baseline, the best weights are kept, one sentence says how it ended."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -62,13 +60,6 @@ def test_the_best_weights_are_those_with_the_lowest_errors(pack: Pack, run: Path
     assert validate(model, pack, model.run)[0] == pytest.approx(best["eval"], rel=1e-6)
     change = 100 * (min(errors) / errors[0] - 1)
     assert f"best at step {best['step']} (errors {change:+.0f} % in the mean" in evaluations[-1]["verdict"]
-
-
-def test_a_score_far_below_0_does_not_choose_the_best_weights_alone() -> None:
-    """R2 -135 of one task and a little less of it is no better than 12 others that got much worse."""
-    start = {"a": torch.tensor([[[136.0, 1.0]]]), **{f"b{i}": cell([2]) for i in range(12)}}
-    later = {"a": torch.tensor([[[100.0, 1.0]]]), **{f"b{i}": cell([4]) for i in range(12)}}
-    assert validation._error(later) > 1.5 * validation._error(start)
 
 
 def test_the_first_of_equally_good_weights_is_kept(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

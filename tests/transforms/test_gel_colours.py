@@ -1,7 +1,5 @@
 """Images of one gel in the colours of another, against the same heights rendered by both."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Views: replayed parameters, exact special cases, and the statistics the paper names."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest
