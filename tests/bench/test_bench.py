@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import declared_leak
 from mvitac.model_files import fresh
 from mvitac.system.files import digest
+from support.forged_packs import Change, put
 from support.pages import drawings
 from support.toy import toy_pack
 
@@ -290,86 +290,44 @@ def test_the_board(results: list[Path], tmp_path: Path, capsys: pytest.CaptureFi
     assert order_of(light, board.encoders).startswith(f"{first} ")
 
 
-def first(value: dict[str, Any], block: int = 0) -> dict[str, Any]:
-    """The first record of a block. That of block 1 is of values."""
-    return value["blocks"][block]["records"][0]
-
-
 def drop(value: dict[str, Any], **about: Any) -> None:
     """Delete the records with these fields."""
     for block in (block for block in value["blocks"] if "records" in block):
         block["records"] = [r for r in block["records"] if any(r.get(name) != wanted for name, wanted in about.items())]
 
 
-def more_correct(value: dict[str, Any]) -> None:
-    first(value)["sums"]["correct"][0] = 1000
-
-
-def negative_errors(value: dict[str, Any]) -> None:
-    first(value, 1)["sums"]["squared_error"][0][0] = -1.0
-
-
-def small_errors(value: dict[str, Any]) -> None:
-    errors = first(value, 1)["sums"]["squared_error"]
-    errors[0] = [x / 1e6 for x in errors[0]]
-
-
-def other_rows(value: dict[str, Any]) -> None:
-    record = first(value)
-    record["sums"]["n"] = [2 * n for n in record["sums"]["n"]]
-
-
-def a_score(value: dict[str, Any]) -> None:
-    first(value)["auroc"] = 1.0
-
-
-def two_seeds(value: dict[str, Any]) -> None:
-    value["encoder"]["seeds"] = [0, 1, 2]
-
-
-def twice(value: dict[str, Any]) -> None:
-    value["blocks"][0]["records"].append(first(value))
-
-
-def mine(value: dict[str, Any]) -> None:
-    value["blocks"][0]["records"].append({**first(value), "source": "mine"})
-
-
-def no_modality(value: dict[str, Any]) -> None:
-    drop(value, source="", modality="both")
-
-
-def one_less(value: dict[str, Any]) -> None:
-    del value["blocks"][3]
-
-
-def not_finite(value: dict[str, Any]) -> None:
-    first(value, 1)["sums"]["error"][0][0] = 1e999
-
-
-FORGED: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
-    "correct": (more_correct, "more correct rows than rows"),
-    "negative squares": (negative_errors, "squared errors are smaller"),
-    "small squares": (small_errors, "squared errors are smaller"),
-    "infinity": (not_finite, "is not finite"),
-    "text": (lambda value: first(value)["sums"].update(correct="x"), "its sums are no numbers"),
-    "no sums": (lambda value: first(value).update(sums={}), "its fields are"),
-    "rows": (other_rows, "is scored on other rows|more correct"),
-    "score": (a_score, "its fields are .*'auroc'"),
-    "seeds": (two_seeds, "has 1 weights for seeds"),
-    "twice": (twice, "is there twice"),
-    "modality": (no_modality, "lacks the encoder, both, 30 % of labels, 0"),
-    "probe": (
-        lambda value: drop(value, source="", probe="30 % of labels"),
-        "lacks the encoder, both, 30 % of labels, 0",
+RECORDS, VALUES = ("blocks", 0, "records"), ("blocks", 1, "records", 0)
+MORE_CORRECT = put(*RECORDS, 0, "sums", "correct", 0, value=1000)
+FEW = "30 % of labels"
+FORGED: dict[str, tuple[Change, str]] = {
+    "correct": (MORE_CORRECT, "more correct rows than rows"),
+    "negative squares": (put(*VALUES, "sums", "squared_error", 0, 0, value=-1.0), "squared errors are smaller"),
+    "small squares": (
+        put(*VALUES, "sums", "squared_error", 0, value=lambda errors: [x / 1e6 for x in errors]),
+        "squared errors are smaller",
     ),
+    "infinity": (put(*VALUES, "sums", "error", 0, 0, value=1e999), "is not finite"),
+    "text": (put(*RECORDS, 0, "sums", "correct", value="x"), "its sums are no numbers"),
+    "no sums": (put(*RECORDS, 0, "sums", value={}), "its fields are"),
+    "rows": (
+        put(*RECORDS, 0, "sums", "n", value=lambda sizes: [2 * n for n in sizes]),
+        "is scored on other rows|more correct",
+    ),
+    "score": (put(*RECORDS, 0, "auroc", value=1.0), "its fields are .*'auroc'"),
+    "seeds": (put("encoder", "seeds", value=[0, 1, 2]), "has 1 weights for seeds"),
+    "twice": (put(*RECORDS, value=lambda records: [*records, records[0]]), "is there twice"),
+    "modality": (lambda value: drop(value, source="", modality="both"), f"lacks the encoder, both, {FEW}, 0"),
+    "probe": (lambda value: drop(value, source="", probe=FEW), f"lacks the encoder, both, {FEW}, 0"),
     "control": (lambda value: drop(value, source="pixels"), "lacks pixels, both, linear, None"),
     "seed of a control": (lambda value: drop(value, source="untrained", seed=1), "lacks untrained, both, 30 %"),
-    "other control": (mine, "has too much of mine"),
-    "task": (one_less, "the suite asks for"),
-    "name": (lambda value: value["encoder"].update(name="untrained"), "the name of a control, 'untrained'"),
-    "images": (lambda value: value["encoder"].update(images_seen=-5), "images_seen is -5"),
-    "form": (lambda value: value["blocks"][0].update(form="mine"), "the suite has no form 'mine'"),
+    "other control": (
+        put(*RECORDS, value=lambda records: [*records, {**records[0], "source": "mine"}]),
+        "has too much of mine",
+    ),
+    "task": (lambda value: value["blocks"].pop(3), "the suite asks for"),
+    "name": (put("encoder", "name", value="untrained"), "the name of a control, 'untrained'"),
+    "images": (put("encoder", "images_seen", value=-5), "images_seen is -5"),
+    "form": (put("blocks", 0, "form", value="mine"), "the suite has no form 'mine'"),
 }
 
 
@@ -384,13 +342,13 @@ def test_a_forged_result_is_refused(
         assert re.search(words, said(capsys, "bench", command, forged)), command
 
 
-DAMAGED: list[tuple[str, Callable[[dict[str, Any]], Any]]] = [
-    ("check", lambda value: first(value).update(sums=3)),
-    ("check", lambda value: value["blocks"][0].update(leaks=1e308)),
+DAMAGED: list[tuple[str, Change]] = [
+    ("check", put(*RECORDS, 0, "sums", value=3)),
+    ("check", put("blocks", 0, "leaks", value=1e308)),
     ("check", lambda value: value["encoder"].pop("seeds")),
-    ("check", lambda value: value.update(blocks=["x"])),
-    ("board", lambda value: first(value).update(modality=["touch"])),
-    ("board", lambda value: value["encoder"].update(parameters=3)),
+    ("check", put("blocks", value=["x"])),
+    ("board", put(*RECORDS, 0, "modality", value=["touch"])),
+    ("board", put("encoder", "parameters", value=3)),
     ("board", lambda value: value["blocks"][0].pop("data")),
 ]
 
@@ -406,13 +364,11 @@ def test_a_damaged_result_is_one_line(
 
 
 def test_names_in_results_are_text(results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def title(value: dict[str, Any]) -> None:
-        value["encoder"]["name"] = "\x1b]0;owned\x07"
-
+    title = put("encoder", "name", value="\x1b]0;owned\x07")
     error = said(capsys, "bench", "check", changed(results[0], tmp_path / "b.json", title, signed=True))
     assert "control character" in error and "\x1b" not in error
     evil = "<img src=http://198.51.100.7>"
-    file = changed(results[0], tmp_path / "a.json", lambda value: value["encoder"].update(name=evil), signed=True)
+    file = changed(results[0], tmp_path / "a.json", put("encoder", "name", value=evil), signed=True)
     page = write_board([file], tmp_path / "x.html").read_text()
     assert "&lt;img src" in page and "<img src=http" not in page
 
@@ -420,7 +376,7 @@ def test_names_in_results_are_text(results: list[Path], tmp_path: Path, capsys: 
 def test_a_changed_result_is_refused(results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "check", *map(str, results)]) == 0
     assert "are those of its sums" in capsys.readouterr().out
-    bad = changed(results[0], tmp_path / "a.json", more_correct, signed=False)
+    bad = changed(results[0], tmp_path / "a.json", MORE_CORRECT, signed=False)
     for command in ("check", "board"):
         assert "does not match its digest" in said(capsys, "bench", command, bad)
     (tmp_path / "g.json").write_text('{"format": "else"}')
@@ -469,12 +425,8 @@ def test_an_encoder_of_one_sense_says_which_it_lacks(root: Path, tmp_path: Path)
 def test_results_of_other_suites_are_refused(
     results: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def older(value: dict[str, Any]) -> None:
-        value["suite"]["seed"] = 1
-
-    assert "does not have the digest" in said(
-        capsys, "bench", "check", changed(results[0], tmp_path / "a.json", older, signed=True)
-    )
+    older = changed(results[0], tmp_path / "a.json", put("suite", "seed", value=1), signed=True)
+    assert "does not have the digest" in said(capsys, "bench", "check", older)
 
     def resigned(value: dict[str, Any]) -> None:
         value["suite"]["seed"] = 1

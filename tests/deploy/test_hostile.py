@@ -8,7 +8,7 @@ import json
 import pickle
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from mvitac.deploy.card import _harmless
 from mvitac.deploy.engine import Engine
 from mvitac.evaluation.run_names import names_of
 from mvitac.system.files import digest, digest_file, read_json, write_json
+from support.forged_packs import Change, put
 
 _touched: list[str] | None = None
 
@@ -53,13 +54,8 @@ def untouched(trap: Path) -> Iterator[None]:
     assert (trap / "process-1" / "letter.txt").read_text() == "dear"
 
 
-Change = Callable[[Path, dict[str, Any]], object]
-"""Changes the run in the header of model.safetensors, or a description, given the trap and what is changed."""
-
-
 def forge(
     folder: Path,
-    trap: Path,
     *,
     run: Change | None = None,
     stored: int | None = None,
@@ -67,14 +63,18 @@ def forge(
     probes: dict[str, torch.Tensor] | None = None,
     files: dict[str, bytes] | None = None,
 ) -> None:
-    """Change the artifact or export in ``folder``, and make every digest fit again."""
+    """Change the artifact or export in ``folder``, and make every digest fit again.
+
+    {trap} in ``run``, that of the header of model.safetensors, stands for the trap beside the folder.
+    """
     file = folder / "model.safetensors"
     if run or stored:
         with safetensors.safe_open(file, "pt") as opened:
             header = opened.metadata()
         value = json.loads(header["run"])
-        (run or data("pack"))(trap, value)
-        header |= {"run": json.dumps(value), "stored": str(stored or header["stored"])}
+        (run or data("pack"))(value)
+        header["run"] = json.dumps(value).replace("{trap}", str(folder.parent / "trap"))
+        header |= {"stored": str(stored or header["stored"])}
         header["header_digest"] = digest([header["run"], header["spec"], header["stored"]])
         safetensors.torch.save_file(safetensors.torch.load_file(file), file, header)
     if probes:
@@ -86,17 +86,13 @@ def forge(
     value = read_json(described, "a description")
     value["files"] = {name: digest_file(folder / name) for name in value["files"] if (folder / name).is_file()}
     if about:
-        about(trap, value)
+        about(value)
     write_json(described, value, sealed=True)
 
 
-def data(name: str, **fields: str) -> Change:
-    """The data is said to be of dataset ``name``; {trap} in a field stands for the trap."""
-
-    def change(trap: Path, run: dict[str, Any]) -> None:
-        run["data"] = {"name": name, **{k: v.replace("{trap}", str(trap)) for k, v in fields.items()}}
-
-    return change
+def data(name: str, **fields: Any) -> Change:
+    """The data is said to be of dataset ``name``."""
+    return put("data", value={"name": name, **fields})
 
 
 COMMANDS = {
@@ -111,7 +107,7 @@ PLACES: list[tuple[str, Change]] = [
     *((command, data("pack", path="{trap}")) for command in COMMANDS),
     ("probe", data("folder", path="{trap}/pairs.csv")),
     ("export", data("touch-and-go", root="{trap}")),
-    ("export", lambda trap, run: run.update(data={"name": "mix", "parts": [f"a={trap}:1", f"b={trap}:2"]})),
+    ("export", data("mix", parts=["a={trap}:1", "b={trap}:2"])),
 ]
 
 
@@ -130,7 +126,7 @@ def trap(tmp_path: Path) -> Path:
 def test_the_place_of_its_data_is_not_opened(
     copy: Path, trap: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, change: Change
 ) -> None:
-    forge(copy, trap, run=change)
+    forge(copy, run=change)
     words = [w.format(artifact=copy, out=tmp_path / "out") for w in COMMANDS[command]]
     with untouched(trap):
         assert main(words) == 2
@@ -139,11 +135,7 @@ def test_the_place_of_its_data_is_not_opened(
 
 
 def encoder(**fields: str) -> Change:
-    def change(trap: Path, run: dict[str, Any]) -> None:
-        for own in run["encoder"].values():
-            own |= {k: v.replace("{trap}", str(trap)) for k, v in fields.items()}
-
-    return change
+    return put("encoder", value=lambda old: {sense: {**own, **fields} for sense, own in old.items()})
 
 
 @pytest.mark.parametrize(
@@ -159,7 +151,7 @@ def test_initial_weights_are_neither_opened_nor_fetched(
 ) -> None:
     """Nor for the controls, which are then of random weights."""
     (trap / "letter.pth").write_text("dear")
-    forge(copy, trap, run=encoder(weights=weights))
+    forge(copy, run=encoder(weights=weights))
     name, *options = (word.format(out=tmp_path / "out") for word in command)
     with untouched(trap):
         assert main([name, str(copy), *options, "--on", str(pack.path)]) == 0
@@ -172,24 +164,12 @@ def test_start_weights_of_another_run_are_not_opened(copy: Path, trap: Path) -> 
     (trap / "letter.safetensors").write_text("dear")
     record = read_json(copy / "run.json", "a record") | {"start": {"name": "older", "trained_on": ["tag"]}}
     (copy / "run.json").write_text(json.dumps(record))
-    forge(copy, trap, run=lambda trap, run: run.update(init={"path": str(trap / "letter.safetensors")}))
+    forge(copy, run=put("init", value={"path": "{trap}/letter.safetensors"}))
     model = mvitac.load(str(copy))
     assert model.run.init.path is None and model.run.init.digest == "unknown"
     assert names_of([copy], [model]) == ["mvitac"]
     found = describe([model], [str(copy)], About())
     assert found["trained_on"] == "toy; starts from older, which was trained on: tag" and found["images_seen"] is None
-
-
-def setting(*keys: str | int, value: Any) -> Change:
-    """``value`` at ``keys`` of what is changed."""
-
-    def change(trap: Path, whole: dict[str, Any]) -> None:
-        inner: Any = whole
-        for key in keys[:-1]:
-            inner = inner[key]
-        inner[keys[-1]] = value
-
-    return change
 
 
 class Payload:
@@ -199,38 +179,35 @@ class Payload:
         return sys.exit, ("unpickled",)
 
 
-def above(trap: Path, whole: dict[str, Any]) -> None:
-    whole["files"]["../trap/pairs.csv"] = "0"
-
-
 MODEL, PROBES = "model.safetensors", "probes.safetensors"
 WEIGHT, BIAS = "pattern.touch.weight", "pattern.touch.bias"
 NO_SPREAD = {"name": "n", "unit": "N", "edges": [], "spread": []}
 LARGE = 10**9  # every image would be resized to it
 OTHER = "its model was trained with"
+ABOVE = put("files", "../trap/pairs.csv", value="0")
 ARTIFACTS: dict[str, tuple[dict[str, Any], str]] = {
     "a pickle": ({"files": {MODEL: pickle.dumps(Payload())}}, "cannot be read as safetensors"),
     "a pickle of probes": ({"files": {PROBES: pickle.dumps(Payload())}}, "cannot be read as safetensors"),
     "a huge header": ({"files": {MODEL: (1 << 40).to_bytes(8, "little") + b"{"}}, "cannot be read as safetensors"),
     "size": (
-        {"stored": LARGE, "about": setting("preprocessing", "stored", value=LARGE)},
+        {"stored": LARGE, "about": put("preprocessing", "stored", value=LARGE)},
         "stored 1000000000: expected 1 to 1024 px",
     ),
     "trunk from the Hub": ({"run": encoder(trunk="hf-hub:stranger/model")}, "unknown trunk"),
     "trunk from a folder": ({"run": encoder(trunk="local-dir:{trap}")}, "unknown trunk"),
-    "unknown dataset": ({"run": setting("data", value={"name": "evil"})}, "unknown dataset 'evil'"),
-    "a field that is none": ({"run": setting("exec", value="rm")}, "unknown field in run 'exec'"),
-    "a list for a number": ({"run": setting("steps", value=[1])}, "steps"),
-    "file above": ({"about": above}, "names others than"),
-    "files are a list": ({"about": setting("files", value=[MODEL])}, "lacks files"),
-    "without model": ({"about": lambda trap, about: about["files"].pop(MODEL)}, "lacks files"),
-    "version": ({"about": setting("format_version", value=99)}, "is not mvitac-artifact"),
-    "no preprocessing": ({"about": setting("preprocessing", value=3)}, "is damaged"),
-    "normalisation": ({"about": setting("preprocessing", "mean", value=[0.5] * 3)}, f"mean is .*, {OTHER}"),
-    "colours": ({"about": setting("preprocessing", "colour_order", value="BGR")}, f"colour_order is BGR, {OTHER}"),
-    "side": ({"about": setting("preprocessing", "size", value=31)}, f"size is 31, {OTHER}"),
-    "probe of sound": ({"about": setting("probes", 0, "modality", value="sound")}, "is damaged"),
-    "one class more": ({"about": setting("probes", 0, "classes", value=["x"] * 4)}, "do not fit"),
+    "unknown dataset": ({"run": put("data", value={"name": "evil"})}, "unknown dataset 'evil'"),
+    "a field that is none": ({"run": put("exec", value="rm")}, "unknown field in run 'exec'"),
+    "a list for a number": ({"run": put("steps", value=[1])}, "steps"),
+    "file above": ({"about": ABOVE}, "names others than"),
+    "files are a list": ({"about": put("files", value=[MODEL])}, "lacks files"),
+    "without model": ({"about": lambda about: about["files"].pop(MODEL)}, "lacks files"),
+    "version": ({"about": put("format_version", value=99)}, "is not mvitac-artifact"),
+    "no preprocessing": ({"about": put("preprocessing", value=3)}, "is damaged"),
+    "normalisation": ({"about": put("preprocessing", "mean", value=[0.5] * 3)}, f"mean is .*, {OTHER}"),
+    "colours": ({"about": put("preprocessing", "colour_order", value="BGR")}, f"colour_order is BGR, {OTHER}"),
+    "side": ({"about": put("preprocessing", "size", value=31)}, f"size is 31, {OTHER}"),
+    "probe of sound": ({"about": put("probes", 0, "modality", value="sound")}, "is damaged"),
+    "one class more": ({"about": put("probes", 0, "classes", value=["x"] * 4)}, "do not fit"),
     "wide probe": ({"probes": {WEIGHT: torch.zeros(3, 9)}}, "reads 9 features"),
     "a number for a probe": ({"probes": {WEIGHT: torch.tensor(1.0)}}, r"weights of shape \(\)"),
     "short bias": ({"probes": {BIAS: torch.zeros(2)}}, "do not fit 3 classes"),
@@ -239,13 +216,13 @@ ARTIFACTS: dict[str, tuple[dict[str, Any], str]] = {
 EXPORTS: dict[str, tuple[dict[str, Any], str]] = {
     name: ({"about": change}, says)
     for name, (change, says) in {
-        "file above": (above, "names others than"),
-        "no tolerance": (lambda trap, about: about.pop("tolerance"), "is damaged"),
-        "a number for a class": (setting("classes", value={"pattern": [1]}), "expected str, got 1"),
-        "a value without unit": (setting("values", value={"force": [{"name": "n"}]}), "field 'unit' is missing"),
-        "no spread": (setting("values", value={"force": [NO_SPREAD]}), "0 edges and 0 spreads: give n ascending"),
-        "a number for outputs": (setting("outputs", value=1e308), "is damaged"),
-        "no inputs": (setting("inputs", value={}), "cannot be run"),
+        "file above": (ABOVE, "names others than"),
+        "no tolerance": (lambda about: about.pop("tolerance"), "is damaged"),
+        "a number for a class": (put("classes", value={"pattern": [1]}), "expected str, got 1"),
+        "a value without unit": (put("values", value={"force": [{"name": "n"}]}), "field 'unit' is missing"),
+        "no spread": (put("values", value={"force": [NO_SPREAD]}), "0 edges and 0 spreads: give n ascending"),
+        "a number for outputs": (put("outputs", value=1e308), "is damaged"),
+        "no inputs": (put("inputs", value={}), "cannot be run"),
     }.items()
 }
 FORGED = [("artifact", *each) for each in ARTIFACTS.values()] + [("onnx", *each) for each in EXPORTS.values()]
@@ -261,16 +238,16 @@ def test_what_is_forged_is_refused(
 ) -> None:
     """Although every digest is in order."""
     folder = shutil.copytree(request.getfixturevalue(kind), tmp_path / kind)
-    forge(folder, trap, **changes)
+    forge(folder, **changes)
     with untouched(trap), pytest.raises(ValueError, match=says):
         opened(folder)
 
 
 def test_a_network_larger_than_the_machine_is_refused_before_it_is_made(
-    copy: Path, trap: Path, monkeypatch: pytest.MonkeyPatch
+    copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A header of a few kilobytes may name one."""
-    forge(copy, trap, run=encoder(trunk="resnetv2_152x4_bit"))
+    forge(copy, run=encoder(trunk="resnetv2_152x4_bit"))
     made, parameter = set(), torch.nn.Parameter.__new__
 
     def counted(cls: type, data: torch.Tensor, requires_grad: bool = True) -> torch.nn.Parameter:

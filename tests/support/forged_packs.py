@@ -1,4 +1,4 @@
-"""Packs changed behind the library's back, with digests that agree with the change."""
+"""Files changed behind the library's back; of packs with digests that agree with the change."""
 
 import json
 from collections.abc import Callable
@@ -8,15 +8,26 @@ from typing import Any
 from mvitac.system.files import digest, digest_file
 
 Spoil = Callable[[Path], object]
+Change = Callable[[Any], object]
+"""Changes what was read from JSON, in place."""
+
+
+def put(*keys: str | int, value: Any) -> Change:
+    """``value`` at ``keys``, or what it makes of the old one there."""
+
+    def change(inner: Any) -> None:
+        for key in keys[:-1]:
+            inner = inner[key]
+        inner[keys[-1]] = value(inner[keys[-1]]) if callable(value) else value
+
+    return change
 
 
 def edited(path: Path, keys: tuple[str, ...], value: Any) -> None:
     """Write ``value`` at ``keys`` of the JSON in ``path``."""
-    content = inner = json.loads(path.read_text())
+    content = json.loads(path.read_text())
     content.pop("sha256", None)  # an edit that is meant
-    for key in keys[:-1]:
-        inner = inner[key]
-    inner[keys[-1]] = value
+    put(*keys, value=value)(content)
     path.write_text(json.dumps(content))
 
 
