@@ -280,7 +280,7 @@ def test_the_board(results: list[Path], tmp_path: Path, capsys: pytest.CaptureFi
     board = gather({r["encoder"]["name"]: r for r in map(read_result, results)})
     assert board.controls == ["majority or mean", "noise only", "border", "pixels", "untrained"]
     table = page[page.index("<table") :]
-    assert table.index(">majority or mean<") < table.index(">untrained<") < table.index(f">{board.encoders[0]}<")
+    assert table.index(f">{board.encoders[0]}<") < table.index(">untrained<") < table.index(">majority or mean<")
     for text in ("stripes: pattern", "12 test instances", "touch, R2", "2 tasks that were not run", "levels", "30"):
         assert text in page, text
     assert len(drawings(page)) == len(board.rows) and "30 % of labels" in page.replace("\xa0", " ")

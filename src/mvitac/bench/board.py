@@ -150,8 +150,8 @@ def order_of(row: Row, names: Sequence[str]) -> str:
 
 
 SCORES = """Mean and 95 % interval over test groups (and seeds, where an encoder has several), in percent: accuracy, or R2
-of values. Controls come first. Encoders follow by their mean rank, which is for reading only: the order of each task is
-below. An empty cell was not run."""
+of values. Encoders come first, by their mean rank, which is for reading only: the order of each task is below. An empty
+cell was not run."""
 ORDER = """'>' means that the 95 % interval of the difference to the next encoder, paired over test groups, excludes 0; '≈'
 that this order is not resolved. If either has one seed, the interval leaves out the variation between seeds.
 Differences are in points, not corrected for the number of comparisons."""
@@ -186,7 +186,7 @@ def _text_table(intro: str, columns: Sequence[str], rows: Sequence[Sequence[str]
 
 def _scores(board: Board) -> list[Markup]:
     """A table of all scores, and folded below it one of the errors of values in their units."""
-    columns, rows, errors, above = [*board.controls, *board.encoders], [], [], ""
+    columns, rows, errors, above = [*board.encoders, *board.controls[::-1]], [], [], ""
     for row in board.rows:
         if row.task != above:
             rows.append([f"{(above := row.task)} ({row.about})"])
@@ -238,7 +238,7 @@ def _bars(board: Board, row: Row) -> Markup:
 
 def _few(board: Board, rows: Sequence[Row]) -> list[Markup]:
     """A table of scores of linear probes fitted with some of the labels."""
-    names = [*board.controls, *board.encoders]
+    names = [*board.encoders, *board.controls[::-1]]
     found = []
     for row in rows:
         found.append([f"{row.task}, {row.modality}{', R2' * (row.score == 'R2')}"])
