@@ -34,8 +34,8 @@ class _BuildOptions:
 
 
 def simulate(argv: list[str]) -> None:
-    """mvitac data simulate materials|grasps --num ... --size ... --seed ... --out DIR"""
-    names = sorted(cls.name for cls in SimulatedConfig.__subclasses__())
+    """mvitac data simulate materials|grasps|taxim --num ... --size ... --seed ... --out DIR"""
+    names = sorted(name for name, cls in DatasetConfig.choices.items() if issubclass(cls, SimulatedConfig))
     usage = f"mvitac data simulate {'|'.join(names)} --out DIR"
     if not argv or argv[0].startswith("-"):
         if asks_help(argv):

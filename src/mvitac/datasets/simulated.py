@@ -32,9 +32,10 @@ def _targets(columns: Sequence[str]) -> tuple[Target, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedConfig(DatasetConfig):
-    """Options of both simulators."""
+    """Options of all simulators."""
 
     names_a_place: ClassVar[bool] = False
+    least: ClassVar[int] = 1
 
     num: int = 6000
     """Number of pairs (materials) or of grasps with three phases each (grasps)."""
@@ -44,12 +45,10 @@ class SimulatedConfig(DatasetConfig):
     """Side of the rendered and stored images in pixels."""
     held_out_sensor: bool = False
     """Use the sensor that is otherwise never used, to test transfer to a new sensor."""
-    contact: bool = False
-    """Also measure depth, position and size of the contact, as tasks with values (grasps: and the shear force)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range(self, 1, 10_000_000, "num")
+        check_range(self, self.least, 10_000_000, "num")
         check_range(self, 0, (1 << 63) - 1, "seed")
 
     def _fingerprint(self, version: int) -> dict[str, Any]:
@@ -58,7 +57,40 @@ class SimulatedConfig(DatasetConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MaterialsConfig(SimulatedConfig):
+class PressConfig(SimulatedConfig):
+    """Options of simulated presses by which sensors."""
+
+    difference: Annotated[bool, tyro.conf.arg(name="subtract-background")] = False
+    """Store (touch - background) / 2 + 128, with the background of the same sensor; no contact is mid-gray."""
+    makes: tuple[str, ...] = ()
+    """Sensors to press with (mvitac.sim.sensors; gelsight, gelsight_mini: real gels). Default: all not held out."""
+    sensors: int = 0
+    """Press with this many sensors drawn at random (palette, LED directions, dots, response), and with --makes if given."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_range(self, 0, 10_000, "sensors")
+        for name in self.makes:
+            if name not in NAMED:
+                raise unknown("sensor", name, NAMED)
+        if self.held_out_sensor and (self.makes or self.sensors):
+            raise ValueError("held_out_sensor presses with that sensor alone: leave out makes and sensors")
+
+    def choice(self) -> tuple[Sensor, ...]:
+        """The sensors that a touch chooses from."""
+        if self.sensors or self.makes:
+            return (*random_sensors(self.seed, self.sensors), *(NAMED[name] for name in self.makes))
+        return tuple(s for s in SENSORS.values() if s.held_out == self.held_out_sensor)
+
+    def check_installed(self) -> None:
+        """ValueError where taxim is asked for and missing; here, and not in each worker."""
+        for sensor in self.choice():
+            if sensor.calibration:
+                measured.folder(sensor.calibration)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaterialsConfig(PressConfig):
     """Simulated touches of 20 material classes, labelled by category, hard/soft and rough/smooth; split by instance."""
 
     name: ClassVar[str] = "materials"
@@ -66,31 +98,15 @@ class MaterialsConfig(SimulatedConfig):
 
     touches: int = 5
     """Touches per instance, each with its own position, force, sensor and lamp."""
-    difference: Annotated[bool, tyro.conf.arg(name="subtract-background")] = False
-    """Store (touch - background) / 2 + 128, with the background of the same sensor; no contact is mid-gray."""
-    makes: tuple[str, ...] = ()
-    """Sensors to press with (mvitac.sim.sensors; gelsight, gelsight_mini: real gels). Default: all not held out."""
-    sensors: int = 0
-    """Press with this many sensors drawn at random (palette, LED directions, dots, response), and with --makes if given."""
+    contact: bool = False
+    """Also measure depth, position and size of the contact, as tasks with values."""
     sensors_per_press: int = 1
     """Rows per touch: the same spot pressed with so many different sensors (for lambda_sensor)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_range(self, 1, math.inf, "touches")
-        check_range(self, 0, 10_000, "sensors")
-        for name in self.makes:
-            if name not in NAMED:
-                raise unknown("sensor", name, NAMED)
-        if self.held_out_sensor and (self.makes or self.sensors):
-            raise ValueError("held_out_sensor presses with that sensor alone: leave out makes and sensors")
         check_range(self, 1, len(self.choice()), "sensors_per_press")
-
-    def choice(self) -> tuple[Sensor, ...]:
-        """The sensors that a touch chooses from."""
-        if self.sensors or self.makes:
-            return (*random_sensors(self.seed, self.sensors), *(NAMED[name] for name in self.makes))
-        return tuple(s for s in SENSORS.values() if s.held_out == self.held_out_sensor)
 
     def on_new_sensor(self) -> "MaterialsConfig | None":
         if self.held_out_sensor:
@@ -100,9 +116,7 @@ class MaterialsConfig(SimulatedConfig):
         return replace(self, **once, makes=(), sensors=0, held_out_sensor=True)
 
     def source(self) -> Source:
-        for sensor in self.choice():
-            if sensor.calibration:
-                measured.folder(sensor.calibration)  # an error here, and not in each worker
+        self.check_installed()
         return Materials(self)
 
 
@@ -175,6 +189,8 @@ class GraspsConfig(SimulatedConfig):
 
     num: int = 5300
     """Number of grasps; each gives three rows (before, during, after)."""
+    contact: bool = False
+    """Also measure depth, position and size of the contact and the shear force, as tasks with values."""
 
     def source(self) -> Source:
         return Grasps(self)
