@@ -302,12 +302,6 @@ def test_changed_weights_are_refused(smoke_run: Path, tmp_path: Path) -> None:
         mvitac.load(tmp_path)
 
 
-def test_says_what_it_is(artifact: Path) -> None:
-    model = mvitac.load(artifact)
-    width = model.embed(touch=np.zeros((32, 32, 3), np.uint8))["touch"].shape[1]
-    assert repr(model) == f"Model(mvitac of mvitac_tiny, trained on toy: features vision {width}, touch {width})"
-
-
 def test_embed_takes_images_in_batches(smoke_run: Path, pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
     """So that memory does not grow with their number; the result is that of one batch."""
     model, images = mvitac.load(smoke_run), pack.images["touch"][:10]

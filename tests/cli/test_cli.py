@@ -11,15 +11,6 @@ from mvitac.cli.main import COMMANDS, HELP, main
 from mvitac.run import Run
 
 
-def test_help_imports_nothing_heavy() -> None:
-    """`mvitac --help` in a fresh interpreter: no torch, numpy, tyro or rich among the modules it loads."""
-    code = "import sys; from mvitac.cli.main import main; main(['--help']); print(sorted(sys.modules))"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert out.startswith(HELP)
-    for heavy in ("torch", "numpy", "tyro", "rich", "mvitac.training"):
-        assert f"'{heavy}'" not in out
-
-
 def test_importing_the_package_imports_no_torch() -> None:
     code = "import sys, mvitac; print('torch' in sys.modules, 'numpy' in sys.modules)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
@@ -32,12 +23,6 @@ def test_help_names_every_command_in_80_columns() -> None:
         assert f"  {name} " in HELP, name
 
 
-@pytest.mark.parametrize("command", ["data", "data --help", "data simulate --help", "data pack --help"])
-def test_data_commands_explain_themselves(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(command.split()) == 0
-    assert capsys.readouterr().out.startswith("usage: mvitac data")
-
-
 @pytest.mark.parametrize("options", [[], ["--recipe", "paper", "--method", "ssvtp"]])
 def test_pretrain_starts_nothing_without_data(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["pretrain", *options]) == 2
@@ -45,27 +30,6 @@ def test_pretrain_starts_nothing_without_data(options: list[str], capsys: pytest
     commands = ("mvitac demo", "mvitac pretrain --data materials --recipe quick")
     for word in ("--data", "folder", "--from RUN.JSON", *commands):
         assert word in said
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_the_whole_road(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """simulate -> info -> pretrain -> probe -> report, as a user types it, on the real simulator."""
-    pack, run, scores = tmp_path / "pack", tmp_path / "run", tmp_path / "scores.json"
-    simulate = f"data simulate materials --num 240 --touches 2 --size 32 --out {pack} --quiet --workers 1"
-    assert main(simulate.split()) == 0
-    assert main(["data", "info", str(pack)]) == 0
-    assert "category" in capsys.readouterr().out
-    choice = ["--data", "pack", "--data.path", str(pack), "--recipe", "smoke"]
-    assert main(["pretrain", *choice, "--out", str(run), "--quiet"]) == 0
-    assert main(["probe", str(run), "--probes", "knn", "--json", str(scores)]) == 0
-    shown = capsys.readouterr().out
-    summary = json.loads(scores.read_text())["summary"]
-    assert set(summary) == {"category", "soft", "rough", "force"}
-    mean = summary["category"]["touch"]["mvitac"]["mean"]
-    assert f"{100 * mean:.1f} [" in shown
-    assert "95 % intervals: over test instances only, for this one seed" in shown
-    assert main(["report", str(run), "--probe", str(scores), "--out", str(tmp_path / "report")]) == 0
-    assert (tmp_path / "report" / "report.html").stat().st_size > 10_000
 
 
 def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(

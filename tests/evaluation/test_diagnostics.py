@@ -10,23 +10,16 @@ from sklearn.linear_model import Ridge
 from mvitac.evaluation import diagnostics as d
 
 
-def test_collapsed_features_look_collapsed() -> None:
+def test_collapsed_features_look_collapsed_and_isotropic_ones_spread() -> None:
     same = torch.ones(50, 8)
     assert d.spread(same) == pytest.approx(0, abs=1e-6)
     assert d.rank_me(same) == pytest.approx(1, abs=1e-3)
     assert d.uniformity(same) == pytest.approx(0, abs=1e-6)
-
-
-def test_isotropic_features_look_spread() -> None:
+    assert d.uniformity(torch.tensor([[1.0, 0.0], [-1.0, 0.0]])) == pytest.approx(-8)  # at distance 2: log exp(-2 * 4)
     z = torch.randn(4000, 16, generator=torch.Generator().manual_seed(0))
     assert d.spread(z) == pytest.approx(1, abs=0.03)
     assert d.rank_me(z) == pytest.approx(16, abs=0.2)
     assert d.rank_me(torch.eye(7)) == pytest.approx(7, rel=1e-4)
-
-
-def test_uniformity_of_opposite_poles() -> None:
-    """Two points at distance 2: log exp(-2 * 4) = -8."""
-    assert d.uniformity(torch.tensor([[1.0, 0.0], [-1.0, 0.0]])) == pytest.approx(-8)
 
 
 def test_alignment_and_gap() -> None:

@@ -93,16 +93,6 @@ def test_auto_on_gpus(capability: tuple[int, int], expected: str, monkeypatch: p
 # -- said and kept ----------------------------------------------------------------------------------------------------
 
 
-def test_emulated_bf16_is_told(hardware: Machine) -> None:
-    told = {}
-    for own in (True, False):
-        hardware(own)
-        told[own] = [Hardware.choose(CPU, asked).sentence for asked in ("auto", "bf16", "fp32")]
-    assert told[True] == ["precision: bf16 (auto)", "precision: bf16", "precision: fp32"]
-    assert told[False][0] == "precision: fp32 (auto, as this CPU does not compute bf16 itself)"
-    assert "this CPU only emulates" in told[False][1] and told[False][2] == told[True][2]
-
-
 @pytest.mark.parametrize("slower", [0.8, 0.95, 1.3])
 def test_auto_is_the_faster_one_where_both_are_computed(slower: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """A Xeon without AMX computes bf16 itself, and more slowly than fp32."""

@@ -243,13 +243,6 @@ def test_no_checkpoint_is_kept_of_weights_that_are_no_numbers(pack: Pack, tmp_pa
     assert 1 <= kept["step"] < 8 and all(torch.isfinite(value).all() for value in kept["method"].values())
 
 
-def test_a_run_tells_its_speed_soon(pack: Pack, tmp_path: Path) -> None:
-    """Steps after the first, which starts everything, so that whoever reads its log can tell the time left."""
-    log = train(smoke(pack, steps=12, log_every=10), tmp_path / "r", quiet=True, validate=False) / "log.jsonl"
-    said = [json.loads(line) for line in log.read_text().splitlines()]
-    assert [line["step"] for line in said if "loss" in line] == [3, 10, 12]
-
-
 def test_resume_refuses_a_different_run(pack: Pack, straight: Path) -> None:
     with pytest.raises(ValueError, match="already holds a run"):
         train(smoke(pack), straight, quiet=True)
@@ -292,18 +285,6 @@ def test_evaluation_never_reads_test_rows(pack: Pack, straight: Path, monkeypatc
     assert used and not set(np.concatenate(used)) & set(pack.rows("test"))
 
 
-def test_one_per_touch_spreads_groups() -> None:
-    """50 groups of 1 to 9 rows: any 25 consecutive rows of the first pass hold 25 different groups."""
-    rng = np.random.default_rng(0)
-    groups = rng.permutation(np.repeat(np.arange(50), rng.integers(1, 10, 50)))
-    order = epoch_order(len(groups), groups, seed=4)
-    assert sorted(order) == list(range(len(groups)))
-    assert len(set(groups[order[:25]])) == 25 and len(set(groups[order[25:50]])) == 25
-    assert not np.array_equal(order, epoch_order(len(groups), groups, seed=5))
-    plain = epoch_order(len(groups), None, seed=4)
-    assert sorted(plain) == list(range(len(groups)))
-
-
 def test_spread_has_no_tail_of_duplicates() -> None:
     """With groups of unequal size, one row of each group in turn would end the epoch with rows of the large ones."""
     rng = np.random.default_rng(0)
@@ -320,6 +301,9 @@ def test_spread_has_no_tail_of_duplicates() -> None:
     assert sorted(spread_order(len(groups), groups, 1)) == list(range(len(groups)))
     assert spread.max() < plain.mean() and spread.mean() < plain.mean() / 2
     assert not np.array_equal(spread_order(len(groups), groups, 1), spread_order(len(groups), groups, 2))
+    equal = rng.permutation(np.repeat(np.arange(50), 4))  # one row of each group, then a second one
+    order = epoch_order(200, equal, 4)
+    assert sorted(order) == list(range(200)) and (np.sort(equal[order].reshape(4, 50)) == np.arange(50)).all()
 
 
 def test_the_spread_sampler_spreads(pack: Pack) -> None:
