@@ -19,7 +19,7 @@ from mvitac.registry import from_json
 from mvitac.report.report import write_report
 from mvitac.run import Optim
 from mvitac.system.files import read_json
-from mvitac.training import validation
+from mvitac.training import log, validation
 from mvitac.training.loop import train
 from mvitac.training.validation import Cells, validate, verdict
 from support.training_runs import power_cut, smoke
@@ -153,6 +153,38 @@ def test_probe_scores_the_best_weights(
     assert main(["probe", str(plain), *asked]) == 2
     error = capsys.readouterr().err
     assert "has no model.best.safetensors: train with --eval-every N" in error and error.count("\n") == 1
+
+
+def test_while_training_a_table_shows_each_evaluation(
+    measured: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A column per task by both senses, R2 and accuracy told apart, within 80 columns; also of a run that is resumed."""
+    settings = smoke(measured, steps=4, eval_every=2, checkpoint_every=2)
+    with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
+        train(settings, tmp_path / "r")
+    train(settings, tmp_path / "r", resume=True)
+    said = [line for line in capsys.readouterr().out.splitlines() if line.strip()]
+    assert max(map(len, said)) <= 80
+    start, second, last = (e["eval"] for e in log_of(tmp_path / "r") if "eval" in e)
+    tasks = ["pattern", "bright", "light", "both"]
+    heads = [at for at, line in enumerate(said) if line.split() == ["step", "loss", "pairs/s", *tasks, "R@5", "change"]]
+    assert len(heads) == 2 and said[heads[0] + 1].split() == ["acc", "%", "acc", "%", "R2", "%", "R2", "%", "%"]
+    for row, values in ((heads[0] + 2, start), (heads[0] + 3, second), (heads[1] + 2, last)):
+        names = [[f"both/linear {task}"] for task in tasks] + [["vision->touch R@5", "touch->vision R@5"]]
+        scores = [100 * np.mean([values[name] for name in keys]) for keys in names]
+        before = [100 * start[keys[0]] for keys in names[:-1]]
+        cells = said[row].split()
+        shown = cells[1:6] if values is start else cells[3:8]
+        assert shown == [f"{score:.1f}" for score in scores]
+        assert values is start or cells[-1] == f"{np.mean(scores[:-1]) - np.mean(before):+.1f}"
+
+
+def test_many_tasks_fit_a_line() -> None:
+    names = [f"vision/linear a_long_name_{i}" for i in range(20)]
+    columns = log.shown_scores(dict.fromkeys([*names, "b touch->vision R@5"], 0.5))
+    widths = log._widths(list(columns))
+    assert list(widths)[-1] == log.RETRIEVED and len(widths) == 8
+    assert len(log._line(["1", "2", "3"], list(widths), "+100.0", widths)) <= log.WIDTH
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -2,10 +2,13 @@
 
 import importlib
 import json
+import re
+import textwrap
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
 from mvitac.registry import to_json, unknown
@@ -14,6 +17,8 @@ from mvitac.system.files import naming, parse_json, write_atomic
 from mvitac.system.progress import say, shown, work
 
 Logger = Callable[[int, dict[str, float]], None]  # called with a step and the values logged at it
+WIDTH = 80  # columns of a terminal
+RETRIEVED = "R@5"
 EARLY = 3  # step of the first log line, so that the speed is known soon
 
 
@@ -24,8 +29,17 @@ class Log:
     """
 
     def __init__(
-        self, out: Path, start: int, num_steps: int, batch_size: int, *, quiet: bool, loggers: tuple[Logger, ...]
+        self,
+        out: Path,
+        start: int,
+        num_steps: int,
+        batch_size: int,
+        measured: Collection[str] = (),
+        *,
+        quiet: bool,
+        loggers: tuple[Logger, ...],
     ) -> None:
+        """``measured``: the tasks whose scores are R2, not accuracies."""
         self.path = out / "log.jsonl"
         kept = [entry for entry in read_log(out) if entry["step"] <= start] if start else []
         self.first = next((entry["eval"] for entry in kept if entry["step"] == 0 and "eval" in entry), {})
@@ -35,12 +49,13 @@ class Log:
         self.loggers, self.start, self.since, self.since_step = loggers, start, time.perf_counter(), start
         self.num_steps, self.batch_size, self.quiet, self.stack = num_steps, batch_size, quiet, ExitStack()
         self.advance_bar: Callable[[int, str], None] = lambda num, text: None
-        self.beside = ""  # text beside the bar
+        self.measured, self.begun = measured, False
+        self.loss, self.speed = "", ""  # the latest ones, as text
 
     def __enter__(self) -> "Log":
         if not self.quiet:
             self.stack.enter_context(shown())
-            bar = work("pre-training", self.num_steps, "steps", done=self.start)
+            bar = work("training", self.num_steps, "steps", done=self.start)
             self.advance_bar = self.stack.enter_context(bar)
         return self
 
@@ -54,28 +69,54 @@ class Log:
         speed = (step - self.since_step) * self.batch_size / max(1e-9, now - self.since)
         self.since, self.since_step = now, step
         self._write({"step": step, **losses, "lr": lr, "pairs_per_s": round(speed, 1)})
-        self.beside = f"loss {losses['loss']:.2f}, {speed:.0f} pairs/s"
+        self.loss, self.speed = f"{losses['loss']:.2f}", f"{speed:.0f}"
 
     def advance(self, step: int) -> None:
         if step == self.start + 1:  # the first step includes start-up: do not measure it
             self.since, self.since_step = time.perf_counter(), step
-        self.advance_bar(1, self.beside)
+        self.advance_bar(1, f"loss {self.loss}, {self.speed} pairs/s" if self.loss else "")
 
     def evaluation(self, step: int, values: dict[str, float], verdict: str = "") -> None:
-        """Log ``values`` of an evaluation, each beside that of step 0; ``verdict`` is a sentence about the whole run."""
+        """Log ``values`` of an evaluation, and print a row of the table; ``verdict`` is a sentence about the whole run."""
         self._write({"step": step, "eval": values, **({"verdict": verdict} if verdict else {})})
         if step == 0:
             self.first = values
-        shown = []
-        for name, value in values.items():
-            if "/linear " in name or name.endswith("R@5"):  # kNN accuracy too is in log.jsonl
-                beside = step and name in self.first and not name.startswith("chance")
-                gain = f" ({value - self.first[name]:+.3f})" if beside else ""
-                shown.append(f"{name} {value:.3f}{gain}")
-        if shown:
-            self.say(f"{'start (baseline)' if step == 0 else f'step {step}'}: {', '.join(shown)}")
-        if verdict:
-            self.say(verdict)
+        if columns := shown_scores(values):
+            self._row(step, columns, values)
+        for clause in verdict.split("; ") if verdict else ():
+            if "neither: " in clause:  # their figures are in log.jsonl
+                clause = re.sub(r" [+-][\d.]+( \[[^]]*\])?", "", clause)
+            self.say(textwrap.fill(clause, WIDTH, subsequent_indent="    "))
+
+    def _row(self, step: int, columns: dict[str, list[str]], values: dict[str, float]) -> None:
+        """Print a row of the table of evaluations, below its heads if it is the first."""
+        widths = _widths(list(columns))
+        if not self.begun:
+            self.begun = True
+            self._heads(columns, widths, values)
+        now, then = (
+            {n: 100 * mean(found[k] for k in keys) for n, keys in columns.items()}
+            for found in (values, self.first or values)
+        )
+        gain = mean(now[name] - then[name] for name in columns if name != RETRIEVED or len(columns) == 1)
+        cells = [f"{now[name]:.1f}" for name in widths]
+        self.say(_line([str(step), self.loss, self.speed], cells, f"{gain:+.1f}" if step else "", widths))
+
+    def _heads(self, columns: dict[str, list[str]], widths: dict[str, int], values: dict[str, float]) -> None:
+        both = any("both/" in key for keys in columns.values() for key in keys)
+        about = (
+            f"on held-out groups (split val): linear probe{' by touch and vision' * both}; change of the mean in points"
+        )
+        if "chance R@5" in values:
+            about += f"; R@5 by chance {100 * values['chance R@5']:.1f}"
+        if left := len(columns) - len(widths):
+            about += f"; {left} more in log.jsonl"
+        self.say(textwrap.fill(about, WIDTH))
+        units = {name: "R2 %" if name.rpartition(" ")[2] in self.measured else "acc %" for name in widths} | {
+            RETRIEVED: "%"
+        }
+        self.say(_line(["step", "loss", "pairs/s"], list(widths), "change", widths))
+        self.say(_line([""] * 3, [units[name] for name in widths], "", widths))
 
     def say(self, text: str) -> None:
         """Print ``text`` on a line above the progress bar."""
@@ -89,6 +130,35 @@ class Log:
         flat = {k: v for k, v in {**entry, **entry.get("eval", {})}.items() if isinstance(v, float)}
         for logger in self.loggers:
             logger(entry["step"], flat)
+
+
+def shown_scores(values: dict[str, float]) -> dict[str, list[str]]:
+    """Columns of the table of evaluations -> names of their scores in ``values``, of which they are the mean.
+
+    A task is shown by both modalities, where there are two. ``RETRIEVED`` is the mean of both directions.
+    """
+    found: dict[str, list[str]] = {}
+    for key in values:
+        if score := re.fullmatch(r"(?:(.+) )?\w+/linear (.+)", key):
+            found[" ".join(filter(None, score.groups()))] = [key]  # both comes last
+    retrieved = [key for key in values if re.search(r"->\w+ R@5$", key)]
+    return found | ({RETRIEVED: retrieved} if retrieved else {})
+
+
+def _widths(names: list[str]) -> dict[str, int]:
+    """Columns that fit into a line of ``WIDTH``, and their widths: the widest are cut, then the last tasks left out."""
+    room = WIDTH - len(_line(["", "", ""], [], "change", {}))
+    most = room // 6
+    names = names if len(names) <= most else [*names[: most - 1], names[-1]]  # retrieval is the last
+    widths = [max(5, len(name)) for name in names]
+    while sum(widths) + len(widths) > room:
+        widths[widths.index(max(widths))] -= 1
+    return dict(zip(names, widths, strict=True))
+
+
+def _line(first: list[str], cells: list[str], last: str, widths: dict[str, int]) -> str:
+    shown = [f"{cell[:width]:>{width}}" for cell, width in zip(cells, widths.values(), strict=True)]
+    return " ".join([f"{first[0]:>6}{first[1]:>7}{first[2]:>8}", *shown, f"{last:>6}"]).rstrip()
 
 
 def read_log(run: Path) -> list[dict[str, Any]]:

@@ -94,8 +94,9 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
     batches = setup.chunks(start, num_steps)
 
     # Only rank 0 logs and evaluates; on the other processes ``log`` is None.
-    log_or_none = Log(out, start, num_steps, run.batch_size, quiet=quiet, loggers=loggers) if world.writes else None
-    with log_or_none or nullcontext() as log, _stop_signals() as stop_requested:
+    measured = {task.name for task in pack.spec.values}
+    made = Log(out, start, num_steps, run.batch_size, measured, quiet=quiet, loggers=loggers) if world.writes else None
+    with made or nullcontext() as log, _stop_signals() as stop_requested:
         if log and not quiet:
             log.say(setup.hardware.sentence)
         validation = Validation(out, run, method, pack, setup.spec, log, setup.kept) if log and validate else None
