@@ -1,20 +1,45 @@
-"""Adapters to other people's encoders: small weights with their names give what their networks are by definition."""
+"""Other people's encoders: adapters against their networks written out, and as models of data of any layout."""
 
+import json
 import math
+import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import onnx
 import pytest
 import safetensors.torch
 import torch
+from onnx import TensorProto, helper
 from torch import Tensor, nn
 
+import mvitac
+from mvitac.bench.external import ExternalModel, open_model
 from mvitac.bench.external.base import parse
 from mvitac.bench.external.encoder import open_encoder, randomised
+from mvitac.bench.external.model import is_noncommercial
 from mvitac.bench.external.preprocessing import Preprocessing
 from mvitac.bench.external.tower import Tower
+from mvitac.cli.main import main
+from mvitac.data.pack import Pack
+from mvitac.datasets.pack import PackConfig
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.features import features
+from mvitac.evaluation.probe import probe_model
+from mvitac.evaluation.retrieval import cross_modal
+from mvitac.experiments.collect import gather, lay_out
+from mvitac.experiments.jobs import do
+from mvitac.experiments.plan import Row
+from mvitac.experiments.table import lines_of
+from mvitac.experiments.table_formats import markdown
+from mvitac.model_files import fresh
+from mvitac.recipes import recipe
 from support.owners import OWNERS, tvl
+from support.small_plans import ROWS, small
+from support.toy import toy_pack
 
 
 @pytest.mark.parametrize("owner", OWNERS)
@@ -125,3 +150,321 @@ def test_random_weights_for_the_control_leave_the_encoder_as_it_is(tmp_path: Pat
     for name, value in untrained.network.state_dict().items():
         assert torch.equal(value, again[name]) and (value.ndim < 2 or not torch.equal(value, before[name]))
     assert open_encoder("external:timm/mvitac_tiny,weights=random,size=32").untrained() is None
+
+
+TINY = "external:timm/mvitac_tiny,weights=random,size=32"
+
+
+def rows(pack: Pack, num: int = 6) -> np.ndarray:
+    return np.arange(num)
+
+
+def test_the_same_network_gives_the_same_features_as_in_a_run(pack: Pack, tmp_path: Path) -> None:
+    run = recipe("smoke", PackConfig(path=pack.path))
+    run = replace(run, encoder=run.encoder.changed(trunk="test_resnet"))
+    ours = fresh(replace(run, augment=replace(run.augment, size=32, whole=None)), pack.spec, pack.size)
+    trunk = ours.encoders["touch"]
+    torch.save(trunk.state_dict(), tmp_path / "trunk.pth")
+    text = f"external:timm/test_resnet,weights={tmp_path / 'trunk.pth'},size=32"
+    theirs, same = open_model(text).on(pack)
+    assert same is pack
+    np.testing.assert_allclose(
+        features(theirs, pack, "touch", rows(pack)), features(ours, pack, "touch", rows(pack)), atol=1e-4
+    )
+    text = f"external:{tmp_path / 'trunk.pth'},trunk=test_resnet,size=32"
+    by_file = open_model(text).on(pack)[0]
+    np.testing.assert_array_equal(
+        features(by_file, pack, "touch", rows(pack)), features(theirs, pack, "touch", rows(pack))
+    )
+
+
+def test_load_gives_a_model_that_embeds_and_is_probed(pack: Pack) -> None:
+    model = mvitac.load(TINY)
+    assert isinstance(model, ExternalModel) and model.seed == 0 and model.trained_on == ("nothing",)
+    model, own = model.on(pack)
+    embedded = model.embed(touch=pack.images["touch"][rows(pack)])["touch"]
+    np.testing.assert_allclose(embedded.numpy(), features(model, own, "touch", rows(pack)), atol=1e-5)
+    found = probe_model(model, own, own.spec.tasks, ["touch", "both"], ["linear"])
+    assert {(r["task"], r["modality"]) for r in found} == {
+        (t.name, m) for t in own.spec.tasks for m in ("touch", "both")
+    }
+    assert cross_modal(model, own) == []
+    with pytest.raises(ValueError, match="has no run"):
+        model.trunk("touch")
+
+
+def test_seeds_draw_other_weights_and_repeat_themselves() -> None:
+    digests = [open_model(f"{TINY},seed={seed}").weights_digest() for seed in (0, 1, 0)]
+    assert digests[0] == digests[2] != digests[1]
+    assert open_model(f"{TINY},mean=none").weights_digest() != digests[0]  # features depend on it, so their cache does
+
+
+def test_sensors_are_encoded_one_by_one(pack: Pack, tmp_path: Path) -> None:
+    two = toy_pack(tmp_path / "two", touch_channels=6, num=12)
+    model, two = open_model(f"{TINY},reads=touch").on(two)
+    one = ExternalModel(model.text, model.parts, pack.spec, 32)
+    both = torch.from_numpy(np.array(two.images["touch"][:3])).permute(0, 3, 1, 2)
+    each = [one.features("touch", both[:, at : at + 3]) for at in (0, 3)]
+    torch.testing.assert_close(model.features("touch", both), torch.cat(each, dim=1))
+
+
+def test_windows_are_opened_where_the_data_has_an_order(pack: Pack, tmp_path: Path) -> None:
+    text = f"{TINY},reads=touch,frames=2"
+    frames = toy_pack(tmp_path / "frames", values=True)
+    model, own = open_model(text).on(frames)
+    assert own.spec.window.frames == 2 and not model.notes
+    later = np.flatnonzero(frames.column("frame") == 1)[:3]
+    found = features(model, own, "touch", later)
+    still, plain = open_model(text).on(pack)
+    assert plain is pack and "repeated" in still.notes[0]
+    images = torch.from_numpy(frames.images["touch"][later]).permute(0, 3, 1, 2)
+    assert not np.allclose(found, still.features("touch", images).numpy(), atol=1e-3)
+    with pytest.raises(ValueError, match="order of its frames"):
+        open_model(f"{text},stride=1").on(pack)
+
+
+def test_backgrounds_are_subtracted_where_the_pack_has_them(pack: Pack) -> None:
+    model = open_model(f"{TINY},reads=touch,background=minus,mean=none,std=none")
+    assert "no" in model.on(pack)[0].notes[0]
+    changed = ExternalModel(model.text, model.parts, replace(pack.spec, difference=True), 32)
+    grey = torch.full((1, 3, 32, 32), 128, dtype=torch.uint8)
+    half = torch.full((1, 3, 32, 32), 0.5)
+    network = model.parts["touch"].network
+    torch.testing.assert_close(changed.features("touch", grey), network(half), atol=1e-5, rtol=1e-4)
+    assert changed.describe()["encoders"]["touch"]["background_subtracted"] is True
+
+
+def test_one_encoder_for_each_sense(pack: Pack) -> None:
+    model = open_model(f"{TINY},reads=touch,title=a+{TINY},seed=1,title=b")
+    assert {m: part.loaded.title for m, part in model.parts.items()} == {"vision": "b", "touch": "a"}
+    assert set(open_model(f"{TINY},reads=vision").encoders) == {"vision"}
+    for text in (f"{TINY}+{TINY}", f"{TINY},reads=touch+{TINY},reads=touch"):
+        with pytest.raises(ValueError, match="one encoder"):
+            open_model(text)
+
+
+@pytest.mark.parametrize("owner", OWNERS)
+def test_every_owners_checkpoint_gives_features_of_a_pack(
+    owner: Callable[..., Any], pack: Pack, tmp_path: Path
+) -> None:
+    text, _ = owner(tmp_path)
+    model, own = open_model(text).on(pack)
+    found = features(model, own, "touch", rows(pack))
+    assert (
+        found.shape == (6, model.encoders["touch"].num_features) and np.isfinite(found).all() and found.std(0).max() > 0
+    )
+    about = model.describe()["encoders"]["touch"]
+    assert about["files"] and about["frames_given"] == 1 and about["trained_on"] == "unknown"
+    wanted = model.parts["touch"].preprocessing
+    assert len(model.notes) == (wanted.frames > 1 and not wanted.still) + (wanted.offset is not None)
+
+
+def onnx_mean(path: Path, side: int | str = 16, batch: int | str = "n", channels: int = 3) -> Path:
+    """A network that gives the mean of each channel."""
+    value = helper.make_tensor_value_info
+    nodes = [helper.make_node("GlobalAveragePool", ["x"], ["y"]), helper.make_node("Flatten", ["y"], ["z"])]
+    ends: Any = [value("x", TensorProto.FLOAT, [batch, channels, side, side])]
+    ends = ends, [value("z", TensorProto.FLOAT, [batch, channels])]
+    made = helper.make_model(helper.make_graph(nodes, "mean", *ends), opset_imports=[helper.make_opsetid("", 13)])
+    made.ir_version = 8
+    onnx.save(made, path)
+    return path
+
+
+class Means(nn.Module):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x.mean(3)
+
+
+FACTORY = """
+from torch import nn
+
+class Net(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.conv = nn.Conv2d(3, 5, 4, 4)
+    def forward(self, x):
+        return self.conv(x)
+
+def good():
+    return Net(), {"size": 16, "licence": "MIT", "title": "net", "trained_on": "ours"}
+
+def nan():
+    net = Net()
+    nn.init.constant_(net.conv.weight, float("nan"))
+    return net, {}
+
+def bare():
+    return Net()
+
+def wrong():
+    return Net(), {"sides": 3}
+
+def six():
+    return nn.Conv2d(6, 5, 4, 4), {}
+
+class Nothing(nn.Module):
+    def forward(self, x):
+        return x[:, :0, 0, 0]
+
+def nothing():
+    return Nothing(), {}
+"""
+
+
+def test_onnx_torchscript_and_python_files(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    onnx_mean(tmp_path / "mean.onnx", 32)
+    (tmp_path / "nets_here.py").write_text(FACTORY)
+    images = torch.from_numpy(pack.images["touch"][rows(pack)]).permute(0, 3, 1, 2)
+    plain = images.float() / 255
+    found = open_model("external:mean.onnx,mean=none,std=none").on(pack)[0]
+    torch.testing.assert_close(found.features("touch", images), plain.mean((2, 3)))
+    assert found.parts["touch"].preprocessing.size == (32, 32) and found.untrained() is None
+    onnx_mean(tmp_path / "one.onnx", 32, batch=1)
+    single = open_model("external:one.onnx,mean=none,std=none").on(pack)[0]
+    torch.testing.assert_close(single.features("touch", images), plain.mean((2, 3)))
+    with pytest.raises(ValueError, match="it takes 1 channels, the images have 3"):
+        open_model(f"external:{onnx_mean(tmp_path / 'gray.onnx', 32, channels=1).name}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch.jit is deprecated
+        torch.jit.script(Means()).save("mean.ts")
+    tokens = open_model("external:mean.ts,mean=none,std=none,size=32,prefix=1").on(pack)[0]
+    torch.testing.assert_close(tokens.features("touch", images), plain.mean(3)[:, 1:].mean(1))  # three tokens of 32
+    net = open_model("external:python:nets_here:good").on(pack)[0]
+    about = net.describe()["encoders"]["touch"]
+    assert (about["title"], about["licence"], about["features"], about["trained_on"]) == ("net", "MIT", 5, "ours")
+    with pytest.raises(ValueError, match="NaN or infinite features of touch"):
+        open_model("external:python:nets_here:nan").on(pack)[0].features("touch", images)
+    for name, words in (
+        ("bare", "no torch module and dict"),
+        ("wrong", "'sides'"),
+        ("six", "does not take images"),
+        ("nothing", r"nets_here:nothing: .*returns \[2, 0\] for two images"),
+        ("no", "has no attribute 'no'"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            open_model(f"external:python:nets_here:{name}")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("external:sparks:file.safetensors", "choose from external:.*sparsh"),
+        ("external:timm/resnet19,weights=random", "unknown trunk 'resnet19'"),
+        ("external:timm/resnet18", "give weights FILE, or scratch"),
+        ("external:timm/vit_base_patch16_clip_224.openai", "clip_quickgelu_224.openai"),
+        (f"{TINY},sice=32", "unknown field.*'sice'.*'size'"),
+        (f"{TINY},size=0", "or less"),
+        (f"{TINY},size=3x4x5", "give 2 numbers"),
+        (f"{TINY},mean=0.1/0.2", "give 3 numbers"),
+        (f"{TINY},mean=grey", "give 3 numbers"),
+        (f"{TINY},frames=two", "expected int"),
+        (f"{TINY},reads=smell", "choose from touch, vision, both"),
+        (f"{TINY},pool=cls", "needs a network with tokens"),
+        ("external:sparsh:none.safetensors", "does not exist: give a {method}_vit"),
+        ("external:none.onnx", "does not exist"),
+        ("external:touch-and-go-cmc:none.pth,reads=both", "reads=touch or reads=vision"),
+    ],
+)
+def test_bad_encoders_are_named_in_one_line(
+    text: str,
+    words: str,
+    pack: Pack,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=words.replace("{", r"\{").replace("}", r"\}")) as caught:
+        open_model(text)
+    assert len(str(caught.value).splitlines()) == 1
+    assert main(["probe", "--encoder", text, "--on", str(pack.path)]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_a_damaged_file_of_each_kind_is_one_line(tmp_path: Path) -> None:
+    for name in ("net.onnx", "net.ts", "net.safetensors,trunk=mvitac_tiny"):
+        (tmp_path / name.split(",")[0]).write_bytes(b"something else")
+        with pytest.raises(ValueError, match="net") as caught:
+            open_model(f"external:{tmp_path / name}")
+        assert len(str(caught.value).splitlines()) == 1
+
+
+def test_probe_writes_what_is_needed_to_check_an_encoder(
+    pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (weights := tmp_path / "w.pth").parent.mkdir(exist_ok=True)
+    network = open_model("external:timm/test_resnet,weights=random").parts["touch"].loaded.network
+    torch.save(network.state_dict(), weights)
+    encoder = f"external:{weights},trunk=test_resnet,size=32,licence=CC-BY-NC-4.0,title=theirs,reads=touch"
+    out = tmp_path / "scores.json"
+    assert main(["probe", "--encoder", encoder, "--on", str(pack.path), "--tasks", "pattern", "--json", str(out)]) == 0
+    printed, result = capsys.readouterr().out, json.loads(out.read_text())
+    assert "theirs (NC)" in printed and "no commercial use" in printed.replace("\n", " ") and "LEAK?" in printed
+    (described,) = result["encoders"]
+    about = described["encoders"]["touch"]
+    assert (
+        about["licence"] == "CC-BY-NC-4.0"
+        and len(about["files"]["w.pth"]) == 64
+        and about["parameters"] == sum(p.numel() for p in network.parameters())
+    )
+    assert about["preprocessing"]["size"] == [32, 32] and described["encoder"] == encoder
+    sources = {r["source"]: r.get("leak") for r in result["records"]}
+    assert sources["theirs (NC)"] == "unknown" and sources["theirs, untrained"] == "" and "pixels" in sources
+    assert {r["modality"] for r in result["records"] if r["source"] == "theirs (NC)"} == {"touch"}
+
+
+def test_an_encoder_is_probed_beside_a_run(smoke_run: Path, pack: Pack) -> None:
+    config = ProbeConfig(tasks=("pattern",), controls=False)
+    result = probe_runs([smoke_run], config, pack, encoders=[TINY])
+    alone = probe_runs([smoke_run], config, pack)
+    assert {r["source"] for r in result["records"]} == {"mvitac", "mvitac_tiny, random"}
+    assert [r for r in result["records"] if "run" in r] == alone["records"]  # the run's scores are those without it
+    for bad, words in (
+        ({"encoders": [TINY, TINY]}, "given twice"),
+        ({"encoders": ["external:none.onnx"]}, "does not exist"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            probe_runs([smoke_run], config, pack, **bad)
+    with pytest.raises(ValueError, match="--on PACK"):
+        probe_runs([], config, encoders=[TINY])
+
+
+def test_a_plan_has_rows_of_encoders(pack: Pack, tmp_path: Path) -> None:
+    encoder = f"external:{onnx_mean(tmp_path / 'mean.onnx')},licence=CC-BY-NC-4.0,trained-on=photos,reads=touch"
+    row = Row(label="theirs", encoder=encoder)
+    plan = small(pack, rows=(ROWS[0], row, Row(label="lost", encoder="external:none.onnx")), seeds=1)
+    config = ProbeConfig(tasks=("pattern",), controls=False)
+    work = lay_out(plan, pack, tmp_path, config)
+    assert [job.label for job in work.jobs] == ["MViTac"] and "does not exist" in work.left_out["lost"]
+    do(work.jobs[0], pack)
+    result = gather(work, tmp_path, config)
+    lines = [line for line in lines_of(result) if line.source == "theirs (NC)"]
+    assert [line.modality for line in lines] == ["touch"] and lines[0].cells["pattern"]["difference"] is not None
+    text = markdown(result, lines_of(result))
+    assert "| theirs (NC) |" in text and "licence CC-BY-NC-4.0, no commercial use" in text
+    kept = (tmp_path / "encoders.json").read_bytes()
+    assert (
+        gather(work, tmp_path, config)["records"] == result["records"]
+        and (tmp_path / "encoders.json").read_bytes() == kept
+    )
+    for bad in ({"method": "simclr"}, {"set": {"steps": 2}}):
+        with pytest.raises(ValueError, match="not trained"):
+            Row(label="x", encoder=TINY, **bad)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="choose a row that is trained"):
+        small(pack, rows=(row,), reference="theirs")
+
+
+@pytest.mark.parametrize(
+    ("licence", "expected"),
+    [
+        ("CC-BY-NC-4.0", True),
+        ("cc-by-nc-sa-4.0", True),
+        ("MIT", False),
+        ("unknown", False),
+        ("Apache-2.0 (owner's code: CC-BY-NC-4.0)", False),
+    ],
+)
+def test_non_commercial_licences(licence: str, expected: bool) -> None:
+    assert is_noncommercial(licence) is expected

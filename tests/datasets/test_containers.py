@@ -22,7 +22,7 @@ from mvitac.datasets.hub import HubConfig
 from mvitac.datasets.lerobot.reader import LeRobotConfig, _nearest, choose
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.datasets.webdataset import WebDatasetConfig
-from support.films import film, shade
+from support.videos import film, shade
 
 
 def packed(config: RowsConfig, out: Path) -> Pack:

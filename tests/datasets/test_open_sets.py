@@ -25,7 +25,7 @@ from mvitac.datasets.slip_grasp import SlipGraspConfig
 from mvitac.datasets.slip_gsmini import SlipGSMiniConfig
 from mvitac.datasets.table.splits import folds
 from mvitac.datasets.vt60 import VT60Config
-from support.films import film, shade
+from support.videos import film, shade
 
 
 def plain(path: Path, value: int) -> None:

@@ -21,7 +21,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.table import table as rows_module
-from support.films import film, shade
+from support.videos import film, shade
 
 Table = list[dict[str, Any]]
 

@@ -29,8 +29,7 @@ from mvitac.recipes import with_method
 from mvitac.run import Optim
 from mvitac.training.loop import train
 from mvitac.training.views import StepViews
-from support.slow_losses import slow_info_nce
-from support.small_methods import ROWS, TINY, build, outcome, small, views
+from support.small_methods import ROWS, TINY, build, outcome, slow_info_nce, small, views
 from support.toy import Toy
 from support.training_runs import smoke
 

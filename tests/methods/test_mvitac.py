@@ -12,8 +12,7 @@ from mvitac.methods.mvitac import PARTS, MViTacConfig
 from mvitac.nn.encoders import SCRATCH, Encoders
 from mvitac.run import Optim
 from mvitac.training.step import build_optimiser
-from support.slow_losses import slow_info_nce
-from support.small_methods import TINY, build, views
+from support.small_methods import TINY, build, slow_info_nce, views
 from support.toy import Toy
 
 CONFIG = MViTacConfig(hidden=24, out=12)

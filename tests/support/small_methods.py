@@ -1,5 +1,6 @@
-"""Every method on a tiny trunk with narrow heads, a batch of noise for it, and its losses on that batch."""
+"""Every method on a tiny trunk with narrow heads, a batch of noise for it, its losses, and InfoNCE written out."""
 
+import math
 from dataclasses import replace
 
 import torch
@@ -45,3 +46,15 @@ def views(method: Method, num: int = 8, seed: int = 5, vision: int = 3, touch: i
 def outcome(method: Method, batch: Views) -> dict[str, torch.Tensor]:
     torch.manual_seed(9)  # dropout, drawn negatives
     return method(batch)
+
+
+def slow_info_nce(query: torch.Tensor, key: torch.Tensor, tau: float) -> float:
+    """Eq. 8 word by word, in float64, one query at a time."""
+    query, key, total = query.detach(), key.detach(), 0.0
+    for i in range(len(query)):
+        q = query[i].double() / query[i].double().norm()
+        ks = [k.double() / k.double().norm() for k in key]
+        numerator = math.exp(float(q @ ks[i]) / tau)
+        denominator = sum(math.exp(float(q @ k) / tau) for k in ks)
+        total += -math.log(numerator / denominator)
+    return total / len(query)

@@ -1,4 +1,4 @@
-"""Videos whose every frame says which it is: its number in black and white blocks, its stream in a band of colour."""
+"""Videos whose every frame says which it is: by black and white blocks and a band of colour, or by its gray."""
 
 import struct
 from collections.abc import Callable
@@ -87,3 +87,13 @@ def edited(path: Path, out: Path, *edits: tuple[int, int]) -> Path:
     data[old + 8 : old + 24] = struct.pack(">I", len(edits)) + b"".join(struct.pack(">III", *e) for e in entries)
     out.write_bytes(data)
     return out
+
+
+def shade(index: int, which: int = 0) -> int:
+    """The gray of frame ``index``: neighbours differ by much more than the codec changes them."""
+    return 20 + (index * 37 + which * 90) % 200
+
+
+def film(path: Path, num: int, which: int = 0, size: tuple[int, int] = (64, 48), rate: int = 25) -> Path:
+    """A video whose frame i is all of ``shade(i)``."""
+    return write_video(path, num, lambda i: np.full((size[1], size[0], 3), shade(i, which), np.uint8), rate=rate)

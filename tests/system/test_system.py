@@ -1,0 +1,196 @@
+"""Files, locks, threads and progress: complete or not at all, the same side by side, and nothing goes unnoticed."""
+
+import io
+import json
+import shutil
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from benchmarks.faults import main
+from benchmarks.fuzz import calls, fuzz
+from filelock import FileLock
+
+from mvitac.data.pack import Pack
+from mvitac.deploy.export import export
+from mvitac.deploy.publish import publish
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.model_files import load
+from mvitac.system import progress
+from mvitac.system.files import read_json, write_json
+from mvitac.system.locks import Busy, new_folder
+from mvitac.system.progress import duration, say, shown, tick, work
+from mvitac.system.threads import in_threads
+from support.processes import begin, finish
+
+COMMANDS = {
+    "publish": lambda run, pack, out: publish(run, out, pack),
+    "export": lambda run, pack, out: export(load(run), pack, out),
+}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_what_another_process_writes_is_left_to_it(name: str, smoke_run: Path, pack: Pack, tmp_path: Path) -> None:
+    (tmp_path / "out.partial").mkdir()
+    (tmp_path / "out.partial" / "theirs").touch()
+    with FileLock(tmp_path / "out.lock"), pytest.raises(Busy, match="is being written by another process"):
+        COMMANDS[name](smoke_run, pack, tmp_path / "out")
+    assert (tmp_path / "out.partial" / "theirs").exists() and not (tmp_path / "out").exists()
+
+
+def test_a_new_folder_is_complete_or_not_there(tmp_path: Path) -> None:
+    (tmp_path / "out.partial").mkdir()
+    (tmp_path / "out.partial" / "of a killed process").touch()
+    with pytest.raises(ZeroDivisionError), new_folder(tmp_path / "out") as partial:
+        (partial / f"{1 / len(list(partial.iterdir()))}").touch()  # it is empty
+    assert not list(tmp_path.iterdir())
+    with new_folder(tmp_path / "out") as partial:
+        (partial / "file").touch()
+    assert [path.name for path in tmp_path.rglob("*")] == ["out", "file"]
+    with pytest.raises(ValueError, match="already exists"), new_folder(tmp_path / "out"):
+        pass
+    assert [path.name for path in tmp_path.rglob("*")] == ["out", "file"]
+
+
+@pytest.mark.parametrize("on_terminal", [True, False])
+def test_bars_tell_the_time_left_and_tick_counts_the_innermost(
+    on_terminal: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream, now = io.StringIO(), [0.0]
+    monkeypatch.setattr(stream, "isatty", lambda: on_terminal)
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr("tqdm.std.time", lambda: now[0])
+    with shown(), work("probing", 30, "probes"), work("pre-training", 100, "steps", done=10) as advance:
+        for _ in range(8):
+            now[0] += 20
+            tick("probes")
+            advance(1, "loss 3.21")
+    text = stream.getvalue()
+    for words in ("pre-training", "18/100", "<27:20", "20.00s/ steps", "loss 3.21", "probing", "8/30"):
+        assert words in text, (words, text)
+    assert ("\x1b[" in text) == on_terminal  # a file gets no cursor movements
+
+
+def test_what_is_done_at_once_is_not_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with shown(), work("packing", 100, "items") as advance:
+        advance(100)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_nothing_is_shown_unasked(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "_Bar", None)  # calling it would raise
+    with work("drawing", 2, "sections") as advance, shown(quiet=True), work("drawing"):
+        advance()
+        tick("probes")
+        say("drawn")
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(("seconds", "said"), [(3.4, "3 s"), (119, "119 s"), (660, "11 min"), (9000, "2.5 h")])
+def test_durations_in_words(seconds: float, said: str) -> None:
+    assert duration(seconds) == said
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    """Torch with two threads, as on a machine of two cores."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_several_at_a_time_and_in_order(two_threads: None) -> None:
+    met = threading.Barrier(4, timeout=30)  # passes only if four run at the same time
+
+    def work(item: int) -> tuple[int, int]:
+        met.wait()
+        return item * item, torch.get_num_threads()
+
+    assert in_threads(work, range(4)) == [(0, 1), (1, 1), (4, 1), (9, 1)]
+    assert torch.get_num_threads() == 2
+
+
+def test_an_error_is_raised_and_the_threads_come_back(two_threads: None) -> None:
+    def work(item: int) -> int:
+        if item == 2:
+            raise ValueError("item 2")
+        return item
+
+    with pytest.raises(ValueError, match="item 2"):
+        in_threads(work, range(5))
+    assert torch.get_num_threads() == 2
+
+
+def test_one_thread_or_one_item_stay_in_this_thread(two_threads: None) -> None:
+    here = threading.get_ident()
+    assert in_threads(lambda _: threading.get_ident(), [0]) == [here]
+    torch.set_num_threads(1)
+    assert in_threads(lambda _: threading.get_ident(), [0, 1]) == [here, here]
+
+
+def test_probes_do_not_depend_on_it(
+    two_threads: None, smoke_run: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two runs and their controls, probed together and one after the other, each time from an empty cache."""
+
+    def scores(threads: int) -> object:
+        torch.set_num_threads(threads)
+        monkeypatch.setenv("MVITAC_CACHE", str(tmp_path / str(threads)))
+        model = load(smoke_run)
+        model.run = replace(model.run, seed=1)
+        other = shutil.copytree(smoke_run, tmp_path / f"run{threads}")
+        model.save(other / "model.safetensors")
+        return probe_runs([smoke_run, other], ProbeConfig(tasks=("bright",), modalities=("both",)), pack)["summary"]
+
+    assert scores(2) == scores(1)
+
+
+def test_nothing_is_lost_or_goes_unnoticed(tmp_path: Path) -> None:
+    argv = ["kills", "flips", "--commands", "pretrain", "--points", "2", "--num", "5"]
+    finish(begin(main, argv, output=tmp_path / "said"), tmp_path / "said")
+    found = json.loads((tmp_path / "said").read_text())
+    killed = found.pop("pretrain")
+    assert killed.pop("changes of the disk") > 2 and killed == {"finished": 2, "failed": []}
+    assert len(found) == 5 and all(each in ({"refused": 5}, {"made again": 5}) for each in found.values()), found
+
+
+def test_any_change_of_a_sealed_file_is_told(tmp_path: Path) -> None:
+    file, value = tmp_path / "run.json", {"steps": 3, "losses": (1.5, 1e-9), "names": {"b": None, "a": "\u00df"}}
+    write_json(file, value, sealed=True)
+    whole = file.read_bytes()
+    assert read_json(file, "a record") == {**value, "losses": [1.5, 1e-9]}
+    silent = []
+    for bit in range(0, 8 * len(whole), 5):
+        file.write_bytes(whole[: bit // 8] + bytes([whole[bit // 8] ^ 1 << bit % 8]) + whole[bit // 8 + 1 :])
+        try:
+            found = read_json(file, "a record")
+        except ValueError:
+            continue
+        if {name: found.get(name) for name in value} != {**value, "losses": [1.5, 1e-9]}:
+            silent.append(bit)
+    assert not silent
+    file.write_bytes(whole.replace(b"3", b"4", 1))
+    with pytest.raises(ValueError, match=r"a record was damaged or edited.*delete the entry"):
+        read_json(file, "a record")
+    file.write_text(json.dumps({"steps": 4}))  # without a digest, as version 0.1.0 wrote
+    assert read_json(file, "a record") == {"steps": 4}
+
+
+def odd_calls(base: Path, said: Path) -> None:
+    made = [one for name in ("data info", "data show") for one in calls(name, base, base)]
+    said.write_text(json.dumps({"made": len(made), **fuzz(made[:: len(made) // 15], base, 20)}))
+
+
+def test_odd_options_show_no_traceback(pack: Pack, tmp_path: Path) -> None:
+    base, said = tmp_path / "base", tmp_path / "result"
+    shutil.copytree(pack.path, base / "pack")
+    (base / "here").mkdir()
+    finish(begin(odd_calls, base, said, output=tmp_path / "said"), tmp_path / "said")
+    found = json.loads(said.read_text())
+    assert found["failed"] == [] and found["calls"] >= 15 and found["made"] > 300
+    assert set(found["codes"]) <= {"0", "2"} and found["codes"]["2"] > 5, found["codes"]
