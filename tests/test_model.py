@@ -225,16 +225,6 @@ def test_trunk_is_a_plain_timm_model(pack: Pack, tmp_path: Path) -> None:
     torch.testing.assert_close(again(inputs), model.embed(touch=images)["touch"])
 
 
-def test_timms_own_transform_is_the_models(model: Model) -> None:
-    """Where images are stored at the size that the encoder sees: timm resizes once, mvitac to both sizes."""
-    import timm
-
-    config = timm.data.resolve_model_data_config(model.trunk("vision"))
-    image = Image.fromarray(np.random.default_rng(2).integers(0, 256, (50, 70, 3), dtype=np.uint8))
-    theirs = timm.data.create_transform(**config, is_training=False)(image)
-    torch.testing.assert_close(theirs, model.transform("vision", normalize=True)(image))
-
-
 def test_trunk_of_two_sensors_has_six_channels(tmp_path: Path) -> None:
     pack = toy_pack(tmp_path / "p", touch_channels=6, num=12)
     model = fresh(recipe("smoke", PackConfig(path=pack.path)), pack.spec, 32)
@@ -273,25 +263,6 @@ def test_background_is_subtracted_before_resizing(model: Model, monkeypatch: pyt
     assert not torch.equal(of_one[1], expected[1])
     with pytest.raises(ValueError, match="there is no touch"):
         model.embed(vision=press, background=free)
-
-
-def test_shared_space_is_normalised(model: Model, pack: Pack) -> None:
-    both = model.embed(vision=pack.images["vision"][:5], touch=pack.images["touch"][:5], shared=True)
-    assert both["vision"].shape == both["touch"].shape == (5, 16)
-    for z in both.values():
-        torch.testing.assert_close(z.norm(dim=1), torch.ones(5))
-
-
-def test_two_sensors_keep_their_order(tmp_path: Path) -> None:
-    pack = toy_pack(tmp_path / "p", touch_channels=6, num=12)
-    run = recipe("smoke", PackConfig(path=pack.path))
-    model = fresh(run, pack.spec, pack.size)
-    stacked = pack.images["touch"][:2]
-    swapped = np.concatenate([stacked[..., 3:], stacked[..., :3]], axis=-1)
-    assert model.embed(touch=stacked)["touch"].shape == (2, 64)
-    assert not torch.allclose(model.embed(touch=stacked)["touch"], model.embed(touch=swapped)["touch"])
-    with pytest.raises(ValueError, match="takes 6 channels"):
-        model.embed(touch=stacked[..., :3])
 
 
 def test_changed_weights_are_refused(smoke_run: Path, tmp_path: Path) -> None:

@@ -76,15 +76,6 @@ def test_digest_is_of_the_outcome() -> None:
     assert crossed.digest() != paired.digest()
 
 
-def test_unknown_names_are_hinted() -> None:
-    with pytest.raises(ValueError, match="did you mean 'modern'"):
-        recipe("modren")
-    value = to_json(recipe("quick"))
-    value["optim"]["learning_rate"] = 1
-    with pytest.raises(ValueError, match=r"field in run\.optim 'learning_rate'"):
-        Run.load(value)
-
-
 @pytest.mark.parametrize("name", ["modern", "quick"])
 def test_a_grasps_phases_are_not_each_others_positives(name: str) -> None:
     """Alike before, during and after the grip would mean blind to the contact."""

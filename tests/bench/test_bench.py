@@ -23,7 +23,6 @@ from mvitac.data.pack import Pack
 from mvitac.deploy.artifact import load
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import features
-from mvitac.evaluation.leaks import declared_leak
 from mvitac.model_files import fresh
 from mvitac.system.files import digest
 from support.forged_packs import Change, put
@@ -190,25 +189,6 @@ def test_what_is_not_there_is_said(results: list[Path], root: Path, capsys: pyte
     assert not list((root / "nothing").glob("*.json"))
 
 
-@pytest.mark.parametrize(
-    ("given", "wrong", "says"),
-    [
-        ("folds = 3", "folds = -3", "folds -3: give 2 or more"),
-        ("folds = 3", "folds = 3\nval_every = 0", "val_every 0: give 1 or more"),
-        ('probes = ["linear"]', "probes = []", "needs at least one of probes, untrained and sets"),
-        ("labels = [0.3]", "labels = [nan]", "task 'pattern': labels nan: give fractions above 0 and below 1"),
-        ('modalities = ["vision"]', "modalities = []", "task 'pattern' has no modalities"),
-        ("seed = 0", "seed = -1", "seed -1: give a number >= 0"),
-    ],
-)
-def test_a_suite_that_asks_for_nothing_is_told(
-    tmp_path: Path, given: str, wrong: str, says: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert given in SUITE
-    (tmp_path / "toys.toml").write_text(SUITE.replace(given, wrong, 1))
-    assert says in said(capsys, "bench", RANDOM.format(0), "--suite", tmp_path / "toys.toml")
-
-
 def test_imagenet_is_a_control_where_its_weights_are(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -264,14 +244,6 @@ def test_a_model_that_saw_the_test_groups_is_marked_and_not_ordered(
     assert " LEAK<" in drawn
     assert "LEAK: 72 of 120 test rows" in page and " LEAK</td>" in page.replace("\xa0", " ")
     assert "none found" in page and clean in page
-
-
-def test_what_its_owner_says_of_the_training_data_is_a_leak_too(root: Path) -> None:
-    toys = find_suite(str(root / "toys.toml"))
-    said = "ImageNet; toy stripes, 2022"
-    assert declared_leak(said, toys.sets[0].names) == "Toy Stripes was in its owner's training, which rows is not known"
-    assert declared_leak(said, ("Touch and Go",)) == "" and declared_leak(None, ()) == "unknown"
-    assert declared_leak("Touch and Go, YCB", ("touch-and-go",)).startswith("touch-and-go was in")
 
 
 def test_the_board(results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -535,6 +507,12 @@ def test_shipped_suites_keep_their_definitions() -> None:
         (SUITE.replace(RANDOM.format(1), "external:python:antigravity:fly"), "weights=random"),
         (SUITE.replace(RANDOM.format(1), "external:timm/resnet18"), "weights=random"),
         (SUITE.replace("external:timm/resnet18.tv_in1k", RANDOM.format(1)), "give external:timm/NAME"),
+        (SUITE.replace("folds = 3", "folds = -3"), "folds -3: give 2 or more"),
+        (SUITE.replace("folds = 3", "folds = 3\nval_every = 0"), "val_every 0: give 1 or more"),
+        (SUITE.replace('probes = ["linear"]', "probes = []"), "needs at least one of probes, untrained and sets"),
+        (SUITE.replace("labels = [0.3]", "labels = [nan]"), "task 'pattern': labels nan: give fractions above 0"),
+        (SUITE.replace('modalities = ["vision"]', "modalities = []"), "task 'pattern' has no modalities"),
+        (SUITE.replace("seed = 0\nuntrained", "seed = -1\nuntrained"), "seed -1: give a number >= 0"),
     ],
 )
 def test_suites_that_are_wrong(text: str, expected: str, tmp_path: Path) -> None:

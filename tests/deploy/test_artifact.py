@@ -117,23 +117,17 @@ def test_the_hub_mixin_takes_the_artifact_there_and_back(
 
     hub, asked = tmp_path / "hub", {}
 
-    class Api:
-        def __init__(self, token: str | None = None) -> None:
-            pass
-
-        def create_repo(self, repo_id: str, *, private: bool, exist_ok: bool) -> Any:
-            asked.update(private=private)
-            return SimpleNamespace(repo_id=repo_id)
-
-        def upload_folder(self, *, repo_id: str, folder_path: Path, **options: Any) -> str:
-            shutil.copytree(folder_path, hub / repo_id)
-            return f"somewhere/{repo_id}"
-
-    def download(repo: str, **options: Any) -> str:
+    def create_repo(repo_id: str, **options: Any) -> Any:
         asked.update(options)
-        return str(hub / repo)
+        return SimpleNamespace(repo_id=repo_id)
 
-    monkeypatch.setattr(hub_mixin, "HfApi", Api)
+    def upload_folder(*, repo_id: str, folder_path: Path, **options: Any) -> str:
+        shutil.copytree(folder_path, hub / repo_id)
+        return f"somewhere/{repo_id}"
+
+    api = SimpleNamespace(create_repo=create_repo, upload_folder=upload_folder)
+    monkeypatch.setattr(hub_mixin, "HfApi", lambda token=None: api)
+    download = lambda repo, **options: asked.update(options) or str(hub / repo)  # noqa: E731
     monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
     assert push(artifact, "someone/touch", private=True) == "somewhere/someone/touch" and asked["private"]
     files = {path.name: digest_file(path) for path in (hub / "someone/touch").iterdir()}

@@ -11,7 +11,6 @@ from sklearn.linear_model import Ridge
 from sklearn.metrics import confusion_matrix, f1_score
 
 from mvitac.evaluation import diagnostics as d
-from mvitac.evaluation import score_text
 from mvitac.evaluation.intervals import interval, least_p, paired_difference
 from mvitac.evaluation.scores import score
 
@@ -148,14 +147,6 @@ def test_groups_without_rows_do_not_count() -> None:
     full = record([5, 7, 2, 9, 4], 0)
     holes = {"group_sizes": [10, 0, 10, 10, 0, 10, 10], "group_correct": [5, 0, 7, 2, 0, 9, 4], "seed": 0}
     assert interval([holes]) == interval([full])
-
-
-def test_a_table_says_how_many_test_groups_its_scores_have() -> None:
-    def told(*groups: int) -> str:
-        return score_text.tested_on({"touch": {str(i): {"groups": num} for i, num in enumerate(groups)}}, "object")
-
-    assert told(24, 24) == "24 test objects" and told(24, 12, 18) == "12 to 24 test objects"
-    assert told(1) == "1 test object, so no interval"
 
 
 def test_collapsed_features_look_collapsed_and_isotropic_ones_spread() -> None:

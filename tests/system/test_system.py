@@ -23,7 +23,7 @@ from mvitac.model_files import load
 from mvitac.system import progress
 from mvitac.system.files import read_json, write_json
 from mvitac.system.locks import Busy, new_folder
-from mvitac.system.progress import duration, say, shown, tick, work
+from mvitac.system.progress import say, shown, tick, work
 from mvitac.system.threads import in_threads
 from support.processes import begin, finish
 
@@ -88,11 +88,6 @@ def test_nothing_is_shown_unasked(capsys: pytest.CaptureFixture[str], monkeypatc
         tick("probes")
         say("drawn")
     assert capsys.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize(("seconds", "said"), [(3.4, "3 s"), (119, "119 s"), (660, "11 min"), (9000, "2.5 h")])
-def test_durations_in_words(seconds: float, said: str) -> None:
-    assert duration(seconds) == said
 
 
 @pytest.fixture

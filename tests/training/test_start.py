@@ -221,22 +221,12 @@ def test_pretrain_warns_of_seen_test_rows(
     pack: Pack, chain: dict[str, Path], smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = smoke(pack, steps=1, eval_every=0)
-    for name, init in (("seen", chain["d"]), ("clean", smoke_run), ("copy", tmp_path / "copy.safetensors")):
-        shutil.copy(smoke_run / "model.safetensors", tmp_path / "copy.safetensors")
-        train(replace(run, init=Init(path=init)), tmp_path / name, quiet=True)
+    for name, init in (("clean", smoke_run), ("seen", chain["d"])):
         said = capsys.readouterr().err
-        if name == "clean":
-            assert said == ""
-        else:
-            expected = {
-                "seen": "has seen what this data tests: 24 of 24",
-                "copy": "leaks of test rows cannot be excluded",
-            }
-            assert said.startswith("mvitac: warning: ") and expected[name] in said and said.count("\n") == 1
-    # A copied file, of which nothing is known
-    assert main(["probe", str(tmp_path / "copy"), "--tasks", "pattern", "--no-controls"]) == 0
-    shown = " ".join(capsys.readouterr().out.split())
-    assert " LEAK?" in shown and "start weights were trained on is unknown" in shown, shown
+        assert said == ""
+        train(replace(run, init=Init(path=init)), tmp_path / name, quiet=True)
+    said = capsys.readouterr().err
+    assert said.startswith("mvitac: warning: ") and "has seen what this data tests: 24 of 24" in said
     start = load_run(tmp_path / "seen")[1]["start"]
     assert start["taken"] == {"vision": ["trunk", "head"], "touch": ["trunk", "head"]}
     assert start["trained_on"] == ["toy"] and len(start["digest"]) == 64
