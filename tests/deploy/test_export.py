@@ -1,4 +1,4 @@
-"""An export is the trained model, or there is none: parity on real inputs, values in their unit, and every way to get it wrong."""
+"""An export is the trained model, or there is none: parity on real inputs, values in their unit, every mistake named."""
 
 import json
 import os
