@@ -337,8 +337,13 @@ class Model(nn.Module):
         kind = encoder.trunk, encoder.temporal, self.levels(modality), self.sides(modality)[0], self.stored
         return digest([safetensors_digest(tensors), *kind])
 
-    def save(self, path: Path) -> None:
-        """Write a .safetensors file with the run and the description of the data in its header."""
+    def save(self, path: Path, *, half: bool = False) -> None:
+        """Write a .safetensors file with the run and the description of the data in its header.
+
+        ``half``: kernels and matrices in fp16, which halves the file. They are fp32 again once loaded.
+        """
         tensors = {name: t.cpu().contiguous() for name, t in self.state_dict().items()}
+        if half:
+            tensors = {name: t.half() if t.ndim > 1 else t for name, t in tensors.items()}
         about = json.dumps(to_json(self.run)), json.dumps(to_json(self.spec)), str(self.stored)
         write_model(path, tensors, dict(zip(ABOUT, about, strict=True)))

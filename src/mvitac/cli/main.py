@@ -9,6 +9,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from mvitac.shipped import with_names
+
 HELP = (Path(__file__).parent / "help.txt").read_text(encoding="utf-8")
 
 COMMANDS = {
@@ -87,7 +89,7 @@ def _run(arguments: list[str]) -> int:
         print(text.read_text(encoding="utf-8"), end="")
         return 0
     module, function = COMMANDS[name].split(":")
-    return getattr(importlib.import_module(f"mvitac.cli.{module}"), function)(rest) or 0
+    return getattr(importlib.import_module(f"mvitac.cli.{module}"), function)(with_names(rest)) or 0
 
 
 def help_file(command: str) -> Path:

@@ -25,6 +25,7 @@ from mvitac.model import Model
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.nn.weights import read_safetensors
 from mvitac.registry import from_json, to_json
+from mvitac.shipped import named
 from mvitac.system.files import brief, fields_of
 
 ARTIFACT = SealedFolder(
@@ -84,8 +85,8 @@ def load(path: str | Path, which: model_files.Which = "last") -> Model:
     """Load a trained model, in eval mode; from an artifact with its probes (``Model.predict``).
 
     Args:
-        path: folder of a run or an artifact, "external:..." for an encoder of other people (``bench.external``), or
-            "owner/name[@revision]" on the Hugging Face Hub. Only a ``str`` that is no folder here is looked up there.
+        path: "base" (the model that the package brings), folder of a run or an artifact, "external:..." for an encoder of
+            other people (``bench.external``), or "owner/name[@revision]" on the Hugging Face Hub. Only a ``str`` that is no folder here is looked up there.
         which: weights of a run: "last", or "best" on split val (kept with ``--eval-every``).
 
     Raises:
@@ -97,6 +98,7 @@ def load(path: str | Path, which: model_files.Which = "last") -> Model:
     """
     if is_encoder(path):
         return open_encoder(str(path))
+    path = named(path) if isinstance(path, str) else path
     local = Path(path)
     found = HUB_ID.fullmatch(path) if isinstance(path, str) else None
     # "runs/frist" beside a folder runs/ is a typing mistake, not a repository.

@@ -161,21 +161,24 @@ def _fit_and_score(run: Path, model: Model, pack: Pack, allow_leak: bool) -> tup
     return learned, _scores(run, model, pack, [record for _, record in fitted])
 
 
-def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool = False) -> Path:
+def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool = False, half: bool = False) -> Path:
     """Write the artifact of a finished run into the new folder ``out``.
 
     It is loaded once, as a check, before it gets its name. ``pack``: data to fit the probes on (default: the data the
     run was trained on). With ``allow_leak``, its rows or groups may be some that the run was trained on; the card says
-    LEAK beside scores. Raises Busy if another process writes ``out``, else ValueError.
+    LEAK beside scores. ``half``: kernels and matrices are rounded to fp16 before. Raises Busy if another process writes
+    ``out``, else ValueError.
     """
     with new_folder(out) as partial:
         model = load(run)
+        for weight in (w for w in model.state_dict().values() if half and w.ndim > 1):
+            weight.copy_(weight.half())
         _, record = load_run(run)
         pack = as_trained(model, pack) if pack else own_data(model, "fit the probes on a pack, --on PACK")
         learned, scores = _fit_and_score(run, model, pack, allow_leak)
         met = sensors_of(pack, pack.rows("train", "val", "unlabelled"))  # by the probes, if not by the encoders
         model.spec = replace(model.spec, sensors=tuple(sorted({*model.spec.sensors, *met})))
-        model.save(partial / "model.safetensors")
+        model.save(partial / "model.safetensors", half=half)
         if model.probes:
             tensors = {f"{r.info.name}.{k}": v for r in model.probes.values() for k, v in r.state_dict().items()}
             data = safetensors.torch.save(tensors)

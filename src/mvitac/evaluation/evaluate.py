@@ -29,6 +29,7 @@ from mvitac.model_files import Which, load, weights_file
 from mvitac.nn.encoders import build_trunk
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run, load_run
+from mvitac.shipped import named
 from mvitac.system.files import check_place, digest_file, read_json, write_json
 from mvitac.system.progress import work
 from mvitac.system.threads import in_threads
@@ -73,7 +74,7 @@ def probe(*runs: str | Path, on: str | Path | Pack | None = None, allow_leak: bo
         >>> scores["summary"]["category"]["touch"]["mvitac"]["mean"]  # doctest: +SKIP
     """
     pack = PackConfig(path=Path(on)).open() if isinstance(on, (str, Path)) else on
-    return probe_runs([Path(run) for run in runs], ProbeConfig(**options), pack, allow_leak=allow_leak)
+    return probe_runs([Path(named(str(run))) for run in runs], ProbeConfig(**options), pack, allow_leak=allow_leak)
 
 
 def probe_runs(

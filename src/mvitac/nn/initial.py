@@ -10,6 +10,7 @@ from tyro.conf import Fixed, arg
 
 from mvitac.nn.encoders import PerFrame
 from mvitac.nn.weights import load_weights, misfit, read_safetensors, safetensors_digest
+from mvitac.shipped import named
 
 MODEL = "model.safetensors"  # the file with the weights in the folder of a run or an artifact
 
@@ -19,8 +20,8 @@ class Init:
     """Start weights from another model. Heads and modalities that are not taken start as the other settings say."""
 
     path: Annotated[Path | None, arg(name="init")] = None
-    """Folder of a finished run or of an artifact, or a .safetensors file with weights. Adapted
-    where the number of channels differs."""
+    """Folder of a finished run or of an artifact, `base` (the model that the package brings), or a .safetensors file
+    with weights. Adapted where the number of channels differs."""
     modalities: Fixed[tuple[Literal["vision", "touch"], ...]] = ()
     """Encoders to take. Default: all that fit, and at least one."""
     heads: Fixed[bool] = True
@@ -39,15 +40,16 @@ class Init:
     def file(self) -> Path:
         """The file with the weights; ValueError if there is none."""
         assert self.path is not None
-        if self.path.is_file():
-            return self.path
-        if not self.path.is_dir():
-            raise ValueError(f"init {self.path} does not exist: give the folder of a run or artifact, or .safetensors")
-        if not (self.path / MODEL).is_file():
-            unfinished = (self.path / "checkpoint.pt").exists()
+        path = Path(named(str(self.path)))
+        if path.is_file():
+            return path
+        if not path.is_dir():
+            raise ValueError(f"init {path} does not exist: give the folder of a run or artifact, or .safetensors")
+        if not (path / MODEL).is_file():
+            unfinished = (path / "checkpoint.pt").exists()
             why = "its run is not finished, continue it with --resume" if unfinished else "give that of a finished run"
-            raise ValueError(f"init {self.path} is a folder without {MODEL}: {why}")
-        return self.path / MODEL
+            raise ValueError(f"init {path} is a folder without {MODEL}: {why}")
+        return path / MODEL
 
     def resolved(self) -> "Init":
         """The same with ``digest``; ValueError if there are no such weights, or they are others than those of it."""
