@@ -86,7 +86,8 @@ def load(path: str | Path, which: model_files.Which = "last") -> Model:
 
     Args:
         path: "base" (the model that the package brings), folder of a run or an artifact, "external:..." for an encoder of
-            other people (``bench.external``), or "owner/name[@revision]" on the Hugging Face Hub. Only a ``str`` that is no folder here is looked up there.
+            other people (``bench.external``), or "owner/name[@revision]" on the Hugging Face Hub. Only a ``str`` that is no
+            folder here is looked up there.
         which: weights of a run: "last", or "best" on split val (kept with ``--eval-every``).
 
     Raises:
