@@ -7,7 +7,7 @@ BASE = Path(__file__).parent / "weights" / "base"
 
 def named(place: str) -> str:
     """The folder of the shipped model if ``place`` is "base" and nothing here has that name, else ``place``."""
-    return str(BASE) if place == "base" and not Path(place).exists() else place
+    return str(BASE) if place == "base" and BASE.exists() and not Path(place).exists() else place
 
 
 def with_names(words: list[str]) -> list[str]:
