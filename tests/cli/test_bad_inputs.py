@@ -379,24 +379,24 @@ def test_files(
 
 # -- places -----------------------------------------------------------------------------------------------------------
 
-PLACES = {"{tmp}/file/below": "not a folder", "{tmp}/" + "n" * 300: "too long", "/proc/mvitac-out": "/proc/mvitac-out"}
+PLACES = {
+    "{tmp}/file/below": "not a folder",
+    "{tmp}/" + "n" * 300: "too long",
+    "/proc/mvitac-out": "/proc/mvitac-out",
+    "{tmp}/mine": "{tmp}/mine",
+}
 
 
 @pytest.mark.parametrize("command", [SIMULATE, PRETRAIN, "probe {run} --json {out}"])
-@pytest.mark.parametrize(("out", "says"), PLACES.items(), ids=("below a file", "long name", "proc"))
+@pytest.mark.parametrize(("out", "says"), PLACES.items(), ids=("below a file", "long name", "proc", "there"))
 def test_a_place_nothing_can_be_written_to(
     refused: Callable[..., str], tmp_path: Path, command: str, out: str, says: str
 ) -> None:
-    """It is noticed before anything is simulated, trained or probed."""
-    (tmp_path / "file").write_text("mine")
+    """It is noticed before anything is simulated, trained or probed, and what is there stays."""
+    (tmp_path / "mine").mkdir()
+    for name in ("file", "mine/thesis.tex"):
+        (tmp_path / name).write_text("mine")
     refused(command.replace("{out}", out), says)
-
-
-@pytest.mark.parametrize("command", [SIMULATE, PRETRAIN])
-def test_what_is_there_stays(refused: Callable[..., str], tmp_path: Path, command: str) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "thesis.tex").write_text("mine")
-    refused(command, "{tmp}/out")
 
 
 def fill_disk(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
@@ -416,7 +416,7 @@ ONE_STEP = PRETRAIN + "--steps 1 --eval-every 0"
 
 
 @pytest.mark.parametrize(
-    "case",
+    ("name", "command", "left"),
     [
         ("touch.npy", SIMULATE + "--num 4", "out.partial"),
         ("samples.parquet", SIMULATE + "--num 4", "out.partial"),
@@ -428,13 +428,8 @@ ONE_STEP = PRETRAIN + "--steps 1 --eval-every 0"
     ],
 )
 def test_full_disk(
-    refused: Callable[..., str],
-    monkeypatch: pytest.MonkeyPatch,
-    finished: Path,
-    tmp_path: Path,
-    case: tuple[str, str, str],
+    refused: Callable[..., str], monkeypatch: Any, finished: Path, tmp_path: Path, name: str, command: str, left: str
 ) -> None:
-    name, command, left = case
     shutil.copytree(finished, tmp_path / "r")
     fill_disk(monkeypatch, name)
     refused(command, name, "No space left on device", left=tuple(left.split()), work=True)
@@ -496,8 +491,6 @@ GOOD = np.zeros((32, 32, 3), np.uint8)
     ("given", "says"),
     [
         ({}, "give vision"),
-        ({"touch": GOOD + 2.5}, r"0, 1\]"),
-        ({"touch": GOOD.astype(int)}, "uint8.*int64"),
         ({"touch": np.zeros((32, 32, 6), np.uint8)}, "3 channels.*6"),
         ({"vision": GOOD[..., 0]}, r"\(32, 32\)"),
         ({"vision": GOOD[:0]}, r"\(0, 32, 3\)"),

@@ -198,20 +198,6 @@ def test_columns_of_a_table_become_values(tmp_path: Path) -> None:
     assert set(pack.column("split")) == {"train", "val", "test"}
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("force_n", "write column:unit"),
-        ("force_n:", "write column:unit"),
-        ("force_n:N,z_mm:mm", "give several columns one name"),
-        ("pose=z_mm:mm,z_mm:mm", "write column:unit"),
-    ],
-)
-def test_values_are_written_with_their_unit(text: str, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        FolderConfig(values=(text,))
-
-
 def test_packs_with_other_units_cannot_be_joined(measured: Pack) -> None:
     other = Pack(measured.path)
     task = replace(other.spec.values[0], targets=(Target(name="level", unit="%"),))

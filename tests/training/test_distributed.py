@@ -20,7 +20,7 @@ from mvitac.system.distributed import World
 from mvitac.training.loop import train
 from mvitac.training.setup import check_divisible
 from mvitac.training.step import Step
-from support.distributed_steps import METHODS, build, loop_run, run_of, third_step, three_steps
+from support.distributed_steps import METHODS, build, loop_run, main, run_of, third_step, three_steps
 from support.mixes import Gel, built
 from support.processes import begin
 from support.small_steps import assert_close, views
@@ -29,8 +29,6 @@ from support.training_runs import batches
 
 def together(folder: Path, *words: str, num: int = 2, fails: bool = False) -> None:
     """Run the worker in ``num`` processes that find each other as torchrun's would."""
-    from support.worker_distributed import main
-
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])
