@@ -64,7 +64,7 @@ class Taxim(Source):
                 ValueTask(name=name, targets=tuple(Target(name=column, unit="mm") for column in columns))
                 for name, columns in TASKS.items()
             ),
-            group_by="press",
+            group_by="contact",
             licence="MIT" if real else LICENCE,
             source="https://pypi.org/project/taxim" if real else f"mvitac.sim.ball version {ball.VERSION}",
             difference=self.config.difference,

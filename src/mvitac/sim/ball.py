@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.sim.gel import relax, render
+from mvitac.sim.gel import F, relax, render
 from mvitac.sim.measured import BALL_MM, MM
 from mvitac.sim.sensors import Sensor
 
@@ -18,6 +18,15 @@ _TAG = 0xBA1
 def depth_mm(radius_mm: float) -> float:
     """Return how deep the ball is in the gel when its contact has this radius, both in mm."""
     return BALL_MM - float(np.sqrt(BALL_MM**2 - radius_mm**2))
+
+
+def imprint(pixels: int, x_mm: float, y_mm: float, radius_mm: float) -> F:
+    """Return the imprint [pixels, pixels] in mm of the ball at (x, y) from the middle of the picture."""
+    pixel = FIELD_MM / pixels
+    axis = (np.arange(pixels, dtype=np.float32) - np.float32((pixels - 1) / 2)) * np.float32(pixel)
+    away = (axis[None] - np.float32(x_mm)) ** 2 + (axis[:, None] - np.float32(y_mm)) ** 2
+    indent = np.sqrt(np.maximum(BALL_MM**2 - away, 0)) - (BALL_MM - depth_mm(radius_mm))
+    return relax(np.maximum(indent, 0).astype(np.float32), pixel_mm=pixel)
 
 
 def press_ball(seed: int, number: int, *, size: int, sensors: Sequence[Sensor], background: bool) -> dict[str, Any]:
@@ -32,14 +41,11 @@ def press_ball(seed: int, number: int, *, size: int, sensors: Sequence[Sensor], 
     radius = BALL_MM * float(rng.uniform(0.4, 0.985))
     place = rng.uniform(-0.46, 0.46, 2) * FIELD_MM
     gain, unit = float(np.exp(rng.uniform(*np.log((0.5, 1.2))))), int(rng.integers(2**31))
+    pressed = imprint(2 * size, float(place[0]), float(place[1]), radius)
     pixel = FIELD_MM / (2 * size)
-    x, y = ((np.arange(2 * size, dtype=np.float32) - (size - 0.5)) * np.float32(pixel) - at for at in place)
-    away = x[None] ** 2 + y[:, None] ** 2
-    indent = np.sqrt(np.maximum(BALL_MM**2 - away, 0)) - (BALL_MM - depth_mm(radius))
-    imprint = relax(np.maximum(indent, 0).astype(np.float32), pixel_mm=pixel)
     draw = partial(render, sensor=sensor, rng=rng, pixel_mm=pixel, size=size, unit=unit, gain=gain)
-    made: dict[str, Any] = {"touch": draw(imprint)}
+    made: dict[str, Any] = {"touch": draw(pressed)}
     if background:
-        made["background"] = draw(np.zeros_like(imprint))
+        made["background"] = draw(np.zeros_like(pressed))
     known = {"contact_x_mm": float(place[0]), "contact_y_mm": float(place[1]), "radius_mm": radius}
     return {**made, "sensor": sensor.name, **known, "depth_mm": depth_mm(radius)}
