@@ -181,16 +181,6 @@ def test_a_folder_that_is_deleted_during_training_is_an_error(pack: Pack, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
-def test_dropout_and_sgd_resume_too(pack: Pack, tmp_path: Path) -> None:
-    method = replace(smoke(pack).method, dropout=0.5)  # type: ignore[call-arg]
-    run = smoke(pack, method=method, optim=Optim(name="sgd", lr=0.05, schedule="cosine"), checkpoint_every=1, steps=4)
-    train(run, tmp_path / "straight", quiet=True, validate=False)
-    with power_cut(2), pytest.raises(RuntimeError, match="power cut"):
-        train(run, tmp_path / "cut", quiet=True, validate=False)
-    train(run, tmp_path / "cut", resume=True, quiet=True, validate=False)
-    assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
-
-
 def command(pack: Pack, out: Path) -> list[str]:
     fields = ["--checkpoint-every", "1", "--eval-every", "0", "--quiet"]
     choice = ["--recipe", "smoke", "--data", "pack", "--data.path", str(pack.path)]
@@ -227,20 +217,16 @@ def test_ctrl_c_saves_and_says_how_to_go_on(pack: Pack, straight: Path, tmp_path
     assert_equal_weights(straight, tmp_path / "r")
 
 
-def test_not_a_number_stops_with_step_parts_and_advice(pack: Pack, tmp_path: Path) -> None:
+def test_not_a_number_stops_and_keeps_the_last_good_checkpoint(pack: Pack, tmp_path: Path) -> None:
+    """Where losses are reported, with step, parts and advice, and before each checkpoint is written."""
     run = smoke(pack, optim=Optim(name="sgd", lr=1e30), log_every=1)
     with pytest.raises(Diverged, match=r"not finite at step \d \(.*vv .*\).*lower --optim\.lr"):
-        train(run, tmp_path / "r", quiet=True)
-    assert not (tmp_path / "r" / "model.safetensors").exists()
-
-
-def test_no_checkpoint_is_kept_of_weights_that_are_no_numbers(pack: Pack, tmp_path: Path) -> None:
-    """Checked before each is written, not only where losses are reported."""
-    run = smoke(pack, optim=Optim(name="sgd", lr=1e30), log_every=8, checkpoint_every=1)
-    with pytest.raises(Diverged, match=r"the last checkpoint is kept"):
-        train(run, tmp_path / "r", quiet=True)
+        train(run, tmp_path / "told", quiet=True)
+    with pytest.raises(Diverged, match="the last checkpoint is kept"):
+        train(replace(run, log_every=8, checkpoint_every=1), tmp_path / "r", quiet=True)
     kept = torch.load(tmp_path / "r" / "checkpoint.pt", weights_only=True)
     assert 1 <= kept["step"] < 8 and all(torch.isfinite(value).all() for value in kept["method"].values())
+    assert not list(tmp_path.glob("*/model.safetensors"))
 
 
 def test_resume_refuses_a_different_run(pack: Pack, straight: Path) -> None:
