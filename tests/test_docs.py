@@ -15,31 +15,15 @@ PAGES = sorted(p.relative_to(ROOT).as_posix() for p in [*ROOT.glob("*.md"), *ROO
 
 
 @pytest.mark.parametrize("name", PAGES)
-def test_links_lead_somewhere(name: str) -> None:
-    page = ROOT / name
-    links = re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())
-    missing = [link for link in links if ":" not in link and not (page.parent / link).exists()]
-    assert not missing
-
-
-@pytest.mark.parametrize("name", PAGES)
-def test_pages_that_are_named_exist(name: str) -> None:
-    """In text and code too: ``docs/x.md`` is from the root."""
-    named = set(re.findall(r"\bdocs/[\w/.-]+\.(?:md|png)\b", (ROOT / name).read_text()))
+def test_a_page_names_what_is_there_and_nothing_twice(name: str) -> None:
+    page, text = ROOT / name, (ROOT / name).read_text()
+    links = re.findall(r"\]\(([^)#\s]+)[^)]*\)", text)
+    assert not [link for link in links if ":" not in link and not (page.parent / link).exists()]
+    named = set(re.findall(r"\bdocs/[\w/.-]+\.(?:md|png)\b", text))  # in text and code too, from the root
     assert not [path for path in sorted(named) if not (ROOT / path).exists()]
-
-
-@pytest.mark.parametrize("name", PAGES)
-def test_no_paragraph_stands_twice(name: str) -> None:
-    """As after an edit by script that put a part of a page in twice."""
-    long = [part for part in re.split(r"\n\s*\n", (ROOT / name).read_text()) if len(part) > 200]
+    long = [part for part in re.split(r"\n\s*\n", text) if len(part) > 200]
     assert not [part[:80] for part, times in Counter(long).items() if times > 1]
-
-
-@pytest.mark.parametrize("name", PAGES)
-def test_lines_of_prose_have_120_characters(name: str) -> None:
-    lines = (ROOT / name).read_text().splitlines()
-    assert not [line for line in lines if len(line) > 120 and not line.lstrip().startswith("|")]
+    assert not [line for line in text.splitlines() if len(line) > 120 and not line.lstrip().startswith("|")]
 
 
 def test_every_picture_is_on_a_page() -> None:

@@ -76,23 +76,17 @@ def test_digest_is_of_the_outcome() -> None:
     assert crossed.digest() != paired.digest()
 
 
-@pytest.mark.parametrize("name", ["modern", "quick"])
-def test_a_grasps_phases_are_not_each_others_positives(name: str) -> None:
-    """Alike before, during and after the grip would mean blind to the contact."""
-    assert recipe(name, GraspsConfig()).positives == "same-image"
-    assert recipe(name, MaterialsConfig()).positives == "same-touch"
+def test_a_grasps_phases_are_not_each_others_positives(pack: Pack) -> None:
+    """Alike before, during and after the grip would mean blind to the contact. New data say so themselves."""
 
-
-def test_a_new_dataset_says_itself_that_its_rows_are_phases() -> None:
     class Phased(PackConfig):
         phased = True
 
-    assert recipe("modern", Phased()).positives == "same-image"
+    for name in ("modern", "quick"):
+        assert recipe(name, GraspsConfig()).positives == recipe(name, Phased()).positives == "same-image"
+        assert recipe(name, MaterialsConfig()).positives == "same-touch"
     assert recipe("paper", Phased()).augment.vision.grayscale == 0
     assert recipe("paper", PackConfig(), phased=False).augment.vision.grayscale == 0.2
-
-
-def test_a_recipe_takes_an_open_pack(pack: Pack) -> None:
     assert recipe("smoke", pack) == recipe("smoke", PackConfig(path=pack.path))
 
 
