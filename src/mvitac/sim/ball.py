@@ -10,8 +10,9 @@ from mvitac.sim.gel import F, relax, render
 from mvitac.sim.measured import BALL_MM, MM
 from mvitac.sim.sensors import Sensor
 
-VERSION = 1  # stored in the pack. Increase it with every change of a pixel.
+VERSION = 2  # stored in the pack. Increase it with every change of a pixel.
 FIELD_MM = 480 * MM  # side of the picture: the height of Taxim's frames
+DRIFT = 0.012  # of a channel's brightness since the gel at rest: standard deviation in the GelSight's frames
 _TAG = 0xBA1
 
 
@@ -44,7 +45,8 @@ def press_ball(seed: int, number: int, *, size: int, sensors: Sequence[Sensor], 
     pressed = imprint(2 * size, float(place[0]), float(place[1]), radius)
     pixel = FIELD_MM / (2 * size)
     draw = partial(render, sensor=sensor, rng=rng, pixel_mm=pixel, size=size, unit=unit, gain=gain)
-    made: dict[str, Any] = {"touch": draw(pressed)}
+    warm = draw(pressed) * rng.normal(1.0, DRIFT, 3)
+    made: dict[str, Any] = {"touch": np.clip(warm + 0.5, 0, 255).astype(np.uint8)}
     if background:
         made["background"] = draw(np.zeros_like(pressed))
     known = {"contact_x_mm": float(place[0]), "contact_y_mm": float(place[1]), "radius_mm": radius}

@@ -9,7 +9,7 @@ Shapes: H, W pixels of a height map, row 0 at the top, x to the right, y down; h
 The gel is a Winkler foundation, independent springs (Johnson, Contact Mechanics, 1985, section 4.3), under a membrane.
 Colour is almost linear in slope and saturates: gels have matt paint and are lit at a grazing angle, with one colour of LED
 per side. A Lambertian model with an overhead term is much too grey (compare Johnson and Adelson, CVPR 2009). Levels, colours
-and dots of `SENSORS` were set by eye, by comparison with pictures of real sensors; no real picture is used.
+and dots of `SENSORS` were set by eye, by comparison with pictures of real sensors; `MEASURED` are real ones (`measured`).
 """
 
 import math
