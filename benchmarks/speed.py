@@ -39,7 +39,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec
 from mvitac.evaluation.classifiers import EPOCHS, train_heads
-from mvitac.evaluation.pack_features import pack_features
+from mvitac.evaluation.features import pack_features
 from mvitac.methods.base import Views
 from mvitac.model import Model
 from mvitac.nn.encoders import SCRATCH, Encoders
@@ -327,8 +327,8 @@ def measure_probe(scale: Scale, pack: Pack, device: torch.device, num: int = 500
     labels = torch.stack([torch.randint(k, (num,)) for k in classes])
     heads = 0.0
     for width in (512, 512, 1024):
-        features = torch.randn(len(seeds), num, width, device=device)
-        heads += clock(lambda f=features: train_heads(f, labels, classes, seeds), device)  # type: ignore[misc]
+        features = torch.randn(num, width, device=device)
+        heads += len(seeds) * clock(lambda f=features: train_heads(f, labels, classes, 0), device)  # type: ignore[misc]
     again = EPOCHS * one * len(seeds) * len(classes) * 2  # touch, vision, and both for each task of each seed
     once = one * len(seeds) + heads
     return {

@@ -26,8 +26,8 @@ from mvitac.data.pack import Pack
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.controls import thumbnails
+from mvitac.evaluation.features import pack_features
 from mvitac.evaluation.intervals import interval, paired_difference
-from mvitac.evaluation.pack_features import pack_features
 from mvitac.evaluation.probe import probe_features, split_rows
 from mvitac.evaluation.score_text import percent, with_interval
 from mvitac.evaluation.scores import pool

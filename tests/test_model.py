@@ -16,7 +16,7 @@ import mvitac
 from mvitac.data.images import difference
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
-from mvitac.evaluation.pack_features import pack_features
+from mvitac.evaluation.features import pack_features
 from mvitac.methods.calandra import CalandraConfig
 from mvitac.model import Model
 from mvitac.model_files import fresh

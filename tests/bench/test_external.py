@@ -358,7 +358,6 @@ def test_onnx_torchscript_and_python_files(pack: Pack, tmp_path: Path, monkeypat
         (f"{TINY},pool=cls", "needs a network with tokens"),
         ("external:sparsh:none.safetensors", "does not exist: give a {method}_vit"),
         ("external:none.onnx", "does not exist"),
-        ("external:touch-and-go-cmc:none.pth,reads=both", "reads=touch or reads=vision"),
     ],
 )
 def test_bad_encoders_are_named_in_one_line(

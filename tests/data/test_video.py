@@ -112,16 +112,6 @@ def test_pieces_put_together_without_encoding_anew_are_refused(made: dict[str, P
         num_frames(path)
 
 
-def test_a_player_that_seeks_shows_the_same_frame(path: Path) -> None:
-    cv2 = pytest.importorskip("cv2")  # what the owners of Touch and Go extract their JPEGs with
-    player = cv2.VideoCapture(str(path))
-    for number, image in frames(path, (3, 60, 137)):
-        player.set(cv2.CAP_PROP_POS_FRAMES, number)
-        seen = player.read()[1][:, :, ::-1]
-        assert read_number(seen) == read_number(image) == (number, "touch")
-    player.release()
-
-
 def test_shrinking_is_that_of_pillow(made: dict[str, Path]) -> None:
     rng = np.random.default_rng(0)
     small = rng.integers(40, 215, (12, 16, 1), np.uint8).repeat(3, 2)  # gray: codecs store colour more coarsely

@@ -131,7 +131,7 @@ def test_frames_without_an_order_are_refused(pack: Pack) -> None:
         windowed(pack, Window(frames=2))
 
 
-@pytest.mark.parametrize("temporal", ["stack", "mean", "attention"])
+@pytest.mark.parametrize("temporal", ["stack", "mean"])
 def test_a_window_trains_probes_and_reloads(presses: Pack, tmp_path: Path, temporal: str) -> None:
     data = PackConfig(path=presses.path, num_frames=2)
     run = recipe("smoke", data)
@@ -160,16 +160,12 @@ def test_a_window_trains_probes_and_reloads(presses: Pack, tmp_path: Path, tempo
     assert isinstance(model.encoders["touch"], PerFrame) == (temporal != "stack")
 
 
-def test_per_frame_features_are_averaged_and_attention_starts_as_the_mean() -> None:
-    config = EncoderConfig(trunk="mvitac_tiny", weights="scratch", temporal="attention")
-    trunk = build_trunk(config, 6, 2).eval()
+def test_per_frame_features_are_averaged() -> None:
+    trunk = build_trunk(EncoderConfig(trunk="mvitac_tiny", weights="scratch", temporal="mean"), 6, 2).eval()
     assert isinstance(trunk, PerFrame)
     images = torch.randn(3, 6, 32, 32)
     apart = [trunk.trunk(part) for part in images.split(3, dim=1)]
     assert torch.allclose(trunk(images), (apart[0] + apart[1]) / 2, atol=1e-6)
-    assert trunk.score is not None
-    torch.nn.init.normal_(trunk.score.weight)
-    assert not torch.allclose(trunk(images), (apart[0] + apart[1]) / 2, atol=1e-3)
 
 
 def test_positives_can_be_near_in_time(presses: Pack, tmp_path: Path) -> None:
@@ -204,8 +200,3 @@ def test_positives_near_in_time_that_cannot_be(presses: Pack, pack: Pack, tmp_pa
     with pytest.raises(ValueError, match="none of the columns frame, seq, time"):
         train(unordered, tmp_path / "run", quiet=True)
     assert not (tmp_path / "run" / "run.json").exists()
-
-
-def test_windows_are_part_of_a_runs_digest(presses: Pack) -> None:
-    plain = recipe("smoke", PackConfig(path=presses.path))
-    assert plain.digest() != replace(plain, data=PackConfig(path=presses.path, num_frames=2)).digest()

@@ -19,7 +19,7 @@ from mvitac.deploy.card import card
 from mvitac.deploy.publish import fit_probes, push
 from mvitac.deploy.search import check_pack
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
-from mvitac.evaluation.pack_features import pack_features
+from mvitac.evaluation.features import pack_features
 from mvitac.evaluation.probe import split_rows
 from mvitac.system.files import digest_file
 

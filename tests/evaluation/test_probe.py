@@ -300,19 +300,16 @@ def test_seeds_whose_automatic_precision_differs_are_seeds_of_one_run(pack: Pack
 
 
 def test_heads_trained_together_are_the_heads_trained_alone() -> None:
-    """Three tasks on the features of two models at once: the weights of each trained by itself."""
+    """Three tasks at once: the weights of each trained by itself."""
     rng = np.random.default_rng(0)
-    features = torch.from_numpy(rng.normal(size=(2, 600, 12)).astype(np.float32))
+    features = torch.from_numpy(rng.normal(size=(600, 12)).astype(np.float32))
     classes = [3, 2, 4]
     labels = torch.from_numpy(np.stack([rng.integers(0, k, 600) for k in classes]))
-    together = train_heads(features, labels, classes, [5, 6])
-    for model, seed in enumerate((5, 6)):
-        alone = train_heads(features[model : model + 1], labels, classes, [seed])[0]
-        for a, b in zip(together[model], alone, strict=True):
-            torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-4)
-    single = train_heads(features[:1], labels[1:2], classes[1:2], [5])[0][0]  # other tasks beside it change nothing
-    torch.testing.assert_close(together[0][1], single, atol=1e-5, rtol=1e-4)
-    assert not torch.allclose(together[0][0], together[1][0], atol=1e-2)
+    together, other = (train_heads(features, labels, classes, seed) for seed in (5, 6))
+    for task, num in enumerate(classes):
+        (single,) = train_heads(features, labels[task : task + 1], [num], 5)
+        torch.testing.assert_close(together[task], single, atol=1e-5, rtol=1e-4)
+    assert not torch.allclose(together[0], other[0], atol=1e-2)
 
 
 def test_tasks_of_one_run_are_probed_together(pack: Pack) -> None:

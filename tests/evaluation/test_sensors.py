@@ -1,4 +1,4 @@
-"""Sensors in probes: statistics from unlabelled images, colours of known sensors, what features tell of the sensor."""
+"""Sensors in probes: statistics from unlabelled images, colours of known sensors."""
 
 import copy
 import json
@@ -22,9 +22,7 @@ from mvitac.evaluation.features import features
 from mvitac.evaluation.sensors import (
     RecolouredPack,
     about_new,
-    cross_sensor,
     describe_statistics,
-    sensor_records,
     sensors_of,
     touch_features,
     unlabelled_rows,
@@ -196,46 +194,13 @@ def test_stripes_have_no_slope_colours(pack: Pack, others: Pack) -> None:
         RecolouredPack(pack, others)
 
 
-def test_a_probe_for_the_sensor(model: Model, others: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Features that hold the sensor's number tell it, those that hold noise do not."""
-    noise = np.random.default_rng(0).normal(size=(120, 8)).astype(np.float32)
-    z = np.concatenate([noise, others.sensors[:, None]], axis=1)
-    monkeypatch.setattr(module, "features", lambda *args: z[args[3]])
-    (record,) = sensor_records(model, others)  # no presses here
-    assert record == {"name": "which sensor", "score": 1.0, "chance": 0.5, "num": len(others.rows("test"))}
-    monkeypatch.setattr(module, "features", lambda *args: noise[args[3]])
-    assert sensor_records(model, others)[0]["score"] < 0.75
-    assert sensor_records(model, with_columns(others, sensor=np.full(120, "one"))) == []
-
-
-def test_cross_sensor_retrieval_counts_presses(others: Pack, model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rows 2 i and 2 i + 1 are one press: equal features find it, one feature for all does not."""
-    press = np.array([f"{i // 2:03d}" for i in range(120)])
-    pressed = with_columns(others, press=press, split=np.full(120, "test"))
-    z = np.random.default_rng(0).normal(size=(60, 64)).astype(np.float32)
-
-    def same(model: Model, pack: Pack, modality: str, rows: np.ndarray) -> np.ndarray:
-        return z[rows // 2]
-
-    monkeypatch.setattr(module, "features", same)
-    found = cross_sensor(model, pressed)
-    assert found == {"name": "same spot, other sensor", "score": 1.0, "chance": pytest.approx(5 / 60), "num": 120}
-    monkeypatch.setattr(module, "features", lambda *args: z[args[3] // 6])  # three presses alike: third, not first
-    assert cross_sensor(model, pressed)["score"] == 1  # type: ignore[index]
-    monkeypatch.setattr(module, "features", lambda *args: np.ones((len(args[3]), 4), np.float32))
-    assert cross_sensor(model, pressed)["score"] == 0  # type: ignore[index]  # ties count against it
-    monkeypatch.setattr(module, "features", lambda *args: z[np.random.default_rng(1).permutation(120)[args[3]] // 2])
-    assert cross_sensor(model, pressed)["score"] < 0.3  # type: ignore[index]
-    assert cross_sensor(model, others) is None
-
-
 def test_probe_command_says_what_it_used(
     smoke_run: Path, pack: Pack, others: Pack, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     on = ["--on", str(others.path), "--learn-on", str(pack.path), "--tasks", "pattern", "--modalities", "touch"]
     out = tmp_path / "scores.json"
     arguments = ["probe", str(smoke_run), *on, "--no-controls", "--allow-leak", "--json", str(out)]
-    assert main([*arguments, "--standardise", "features", "--sensors"]) == 0
+    assert main([*arguments, "--standardise", "features"]) == 0
     printed = capsys.readouterr().out
     assert "unlabelled images of sensor toy" in printed
     assert "sensor negative, plain is new to the model, which knows toy: --standardise features is used" in printed

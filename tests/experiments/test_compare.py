@@ -35,8 +35,7 @@ from mvitac.experiments import collect, jobs
 from mvitac.experiments.collect import cost, gather, lay_out, leaks, pairs_of
 from mvitac.experiments.cross_validation import lay_out_folds
 from mvitac.experiments.jobs import do_all
-from mvitac.experiments.paper_plans import ABLATION, PLANS, TABLE1, TABLE2, find_plan
-from mvitac.experiments.plan import Plan, Row, changed, setting, slug
+from mvitac.experiments.plan import PLANS, Plan, Row, changed, find_plan, setting, slug
 from mvitac.experiments.table import Line, as_printed, lines_of
 from mvitac.experiments.table_formats import _tabular, comma, latex, markdown, write_tables
 from mvitac.recipes import RECIPES, recipe
@@ -47,6 +46,8 @@ from mvitac.training.step import Step
 from support.processes import begin, finish
 from support.small_plans import ROWS, small
 from support.toy import Toy, toy_pack
+
+TABLE1, TABLE2, ABLATION = map(find_plan, PLANS[:3])
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +67,7 @@ def done(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, di
 @pytest.mark.parametrize("name", PLANS)
 @pytest.mark.parametrize("recipe_name", RECIPES)
 def test_every_row_of_every_plan_is_a_run(name: str, recipe_name: str) -> None:
-    plan = replace(PLANS[name], recipe=recipe_name)
+    plan = replace(find_plan(name), recipe=recipe_name)
     for row in plan.rows:
         run = plan.run(row, MaterialsConfig(), 7)
         assert run.seed == 7 and run.method.name == row.method
@@ -257,7 +258,9 @@ def test_changed_fields_are_checked() -> None:
 
 def test_result_and_tables_agree(done: tuple[Path, dict]) -> None:
     out, result = done
-    assert {p.name for p in out.glob("table.*")} == {"table.md", "table.tex", "table.csv", "table.png"}
+    assert {p.name for p in out.glob("table.*")} == {
+        f"table.{end}" for end in ("md", "tex", "csv", "pattern.png", "bright.png")
+    }
     lines = {(line.source, line.modality): line for line in lines_of(result)}
     touch = lines["MViTac", "touch"].cells["pattern"]
     own = [

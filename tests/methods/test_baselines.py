@@ -12,7 +12,7 @@ import torch.nn.functional as F
 
 from mvitac.data.pack import Pack
 from mvitac.evaluation.diagnostics import spread
-from mvitac.evaluation.pack_features import pack_features
+from mvitac.evaluation.features import pack_features
 from mvitac.evaluation.probe import probe_model, split_rows
 from mvitac.methods.calandra import CalandraConfig
 from mvitac.methods.cmc import CMC, CMCConfig

@@ -231,8 +231,6 @@ def test_frames_are_channels_or_images_with_one_mask(name: str) -> None:
     assert torch.isfinite(outcome(stacked, twice)["loss"])
     if isinstance(stacked, MAE):
         assert stacked.decoders["touch"].out.out_features == 6 * SIDE**2  # type: ignore[union-attr]
-    with pytest.raises(ValueError, match=r"temporal attention: give --encoder\.temporal mean or stack"):
-        config.build(seen, TINY_VIT.changed(temporal="attention"))
     with pytest.raises(ValueError, match=r"senses both .*--encoder\.temporal stack"):
         replace(config, senses="both").build(seen, TINY_VIT.changed(temporal="mean"))
 

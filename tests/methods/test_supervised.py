@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from sklearn.metrics import mean_absolute_error
 
 from mvitac.data.pack import Pack
-from mvitac.evaluation.pack_features import pack_features
+from mvitac.evaluation.features import pack_features
 from mvitac.evaluation.probe import probe_model, split_rows
 from mvitac.methods.base import Views
 from mvitac.methods.calandra import CalandraConfig

@@ -14,31 +14,28 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
 from mvitac.report import contact_sheet
-from mvitac.report.image_grid import Block, Tile, draw, pair
+from mvitac.report.contact_sheet import draw, pair
 from support.toy import Toy
 
 
 def test_strips_hold_their_class_and_spread_over_groups(pack: Pack) -> None:
     found, num_all = contact_sheet.strips(pack, num=20)
-    assert [strip.name for strip in found] == ["columns", "rows", "checks"]
+    assert [heading for heading, _ in found] == [f"{n}: 40 rows, 20 instances" for n in ("columns", "rows", "checks")]
     assert num_all == 3
-    for label, strip in enumerate(found):
-        assert (pack.column("label_pattern")[strip.rows] == label).all()
-        assert len(set(pack.column("group")[strip.rows])) == 20
-        assert strip.num_rows == 40 and strip.num_groups == 20
-    again = contact_sheet.strips(pack, num=20)[0]
-    assert all((a.rows == b.rows).all() for a, b in zip(found, again, strict=True))
-    assert any(
-        (a.rows != b.rows).any() for a, b in zip(found, contact_sheet.strips(pack, num=20, seed=1)[0], strict=True)
-    )
+    for label, (_, rows) in enumerate(found):
+        assert (pack.column("label_pattern")[rows] == label).all()
+        assert len(set(pack.column("group")[rows])) == 20
+    again, other = (contact_sheet.strips(pack, num=20, seed=seed)[0] for seed in (0, 1))
+    assert all((a == b).all() for (_, a), (_, b) in zip(found, again, strict=True))
+    assert any((a != b).any() for (_, a), (_, b) in zip(found, other, strict=True))
 
 
 def test_strips_by_column_and_split(pack: Pack) -> None:
     found, num_all = contact_sheet.strips(pack, "group", limit=7, num=9)
     assert len(found) == 7 and num_all == 60
-    assert all(len(strip.rows) == 2 for strip in found)
+    assert all(len(rows) == 2 for _, rows in found)
     tested, _ = contact_sheet.strips(pack, "bright", split="test", num=50)
-    assert set(pack.column("split")[np.concatenate([s.rows for s in tested])]) == {"test"}
+    assert set(pack.column("split")[np.concatenate([rows for _, rows in tested])]) == {"test"}
     for options, says in (({"by": "patern"}, "did you mean 'pattern'"), ({"split": "dev"}, "unknown split 'dev'")):
         with pytest.raises(ValueError, match=says):
             contact_sheet.strips(pack, **options)
@@ -57,8 +54,8 @@ def test_pixels_lie_where_they_should(tmp_path: Path, touch_channels: int) -> No
     found, num_all = contact_sheet.strips(pack, num=3)
     picture = np.asarray(contact_sheet.to_image(pack, found, num_all, side=32))
     tops = []
-    for strip in found:
-        for row in strip.rows:
+    for _, rows in found:
+        for row in rows:
             sensors = np.split(pack.images["touch"][row], touch_channels // 3, axis=2)
             ((top, _),) = places(picture, np.concatenate([pack.images["vision"][row], *sensors], axis=1))
             tops.append(top)
@@ -108,8 +105,8 @@ def test_mistakes_in_one_line(
 
 def test_a_grid_wraps_its_pictures_and_keeps_captions_below_them() -> None:
     colours = np.random.default_rng(0).integers(0, 200, (8, 3), np.uint8)
-    tiles = [Tile(np.tile(colour, (40, 100, 1)), "one caption") for colour in colours]
-    picture = np.asarray(draw("title", [Block("heading", tiles)], width=640))
+    tiles = [(np.tile(colour, (40, 100, 1)), "one caption") for colour in colours]
+    picture = np.asarray(draw("title", [("heading", tiles)], width=640))
     corners = [tuple(np.argwhere((picture == colour).all(2))[0]) for colour in colours]
     tops, lefts = zip(*corners, strict=True)
     assert picture.shape[1] <= 640 and sorted(set(tops)) == sorted(tops)[::4] and len(set(lefts)) == 4

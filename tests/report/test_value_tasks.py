@@ -27,14 +27,13 @@ from mvitac.evaluation.score_text import cell_text
 from mvitac.evaluation.scores import summarise, summarise_again
 from mvitac.experiments import table_formats
 from mvitac.experiments.plan import Plan, Row
-from mvitac.experiments.table import Line, lines_of, target_lines
+from mvitac.experiments.table import lines_of, target_lines
 from mvitac.recipes import recipe
 from mvitac.registry import to_json
 from mvitac.report import figures
 from mvitac.report.galleries import _labels
 from mvitac.report.report import write_report
 from mvitac.report.tables import print_summary
-from mvitac.report.value_figures import predicted
 from mvitac.system.files import read_json
 from mvitac.training.loop import train
 from support.pages import drawings
@@ -146,7 +145,8 @@ def test_one_test_group_of_values_alone(tmp_path: Path) -> None:
     assert np.nanmax(level[labels == 0]) <= np.nanmin(level[labels == 4])
     rows = csv.reader(io.StringIO(table_formats.comma(compared(stored))))
     assert not any(value in ("inf", "-inf", "nan") for row in rows for value in row)
-    figures.comparison(lines_of(compared(stored)))
+    axes = table_formats.figure(lines_of(compared(stored)), "light", "R2").axes[0]
+    assert axes.get_yticklabels()[0].get_text() == "mvitac" and axes.get_xlabel().startswith("R2 %")
 
 
 def compared(result: dict[str, Any]) -> dict[str, Any]:
@@ -201,14 +201,10 @@ def test_figures_cut_off_what_no_axis_can_show() -> None:
     assert "-4000.0" in {text.get_text() for text in drawn.axes[0].texts}
     whiskers = [line.get_xdata() for line in drawn.axes[0].lines if line.get_linestyle() == "-"]
     assert [20, 20] not in [list(x) for x in whiskers]
-    lines = [Line(s, "touch", {"force": {**c, "targets": []}}, False) for s, c in cells.items()]
-    axes = figures.comparison(lines).axes[0]
-    assert axes.get_xlabel() == "R2 %" and min(axes.get_xlim()) > -70
-    assert [line.get_marker() for line in axes.lines if line.get_label() == "touch"] == ["o", "<"]
 
 
 def test_predictions_that_are_exact_lie_on_the_line() -> None:
-    drawn: Figure = predicted("force", [[0, 0], [2, 2], [4, 1000]], "N", "blue")
+    drawn: Figure = figures.predicted("force", [[0, 0], [2, 2], [4, 1000]], "N", "blue")
     (axes,) = drawn.axes
     (line,) = axes.lines
     assert list(line.get_xdata()) == list(line.get_ydata()) and axes.get_xlim() == axes.get_ylim()

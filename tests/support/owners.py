@@ -11,8 +11,7 @@ from pathlib import Path
 import safetensors.torch
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
-from torchvision.models.resnet import BasicBlock, ResNet
+from torch import Tensor
 
 Weights = dict[str, Tensor]
 D, HEADS, GRID = 128, 2, 3
@@ -209,35 +208,4 @@ def tvl(folder: Path) -> tuple[str, Callable[[Tensor], Tensor]]:
     return f"external:tvl:{folder / 'tvl_enc_vits.pth'}", slow
 
 
-def small_resnet(channels: int) -> ResNet:
-    """torchvision's, narrow and with one block per stage, and statistics that are not those of a new one."""
-    torch.manual_seed(0)
-    network = ResNet(BasicBlock, [1, 1, 1, 1])
-    network.conv1 = nn.Conv2d(channels, 64, 7, 2, 3, bias=False)
-    network.inplanes = 64
-    for i, width in enumerate((16, 24, 32, 40)):
-        setattr(network, f"layer{i + 1}", network._make_layer(BasicBlock, width, 1, stride=1 + (i > 0)))
-    for module in network.modules():
-        if isinstance(module, nn.BatchNorm2d):
-            nn.init.normal_(module.running_mean, std=0.1)  # type: ignore[arg-type]
-            nn.init.uniform_(module.running_var, 0.5, 2)  # type: ignore[arg-type]
-    network.fc = nn.Identity()  # type: ignore[assignment]
-    return network.eval()
-
-
-def notebooks(folder: Path) -> tuple[str, Callable[[Tensor], Tensor]]:
-    network = small_resnet(6)
-    torch.save(nn.Sequential(*list(network.children())[:8]).state_dict(prefix="encoder."), folder / "state_dict_tac")
-    return f"external:mvitac-notebooks:{folder / 'state_dict_tac'},size=64", network
-
-
-def cmc(folder: Path) -> tuple[str, Callable[[Tensor], Tensor]]:
-    touch, vision = small_resnet(3), small_resnet(3)
-    nn.init.zeros_(vision.conv1.weight)
-    found = {f"encoder.module.touch_to_image.{n}": v for n, v in touch.state_dict().items()}
-    found |= {f"encoder.module.image_to_touch.{n}": v for n, v in vision.state_dict().items()}
-    torch.save({"model": found | {"encoder.module.touch_to_image.fc.weight": torch.ones(128, 512)}}, folder / "cmc.pth")
-    return f"external:touch-and-go-cmc:{folder / 'cmc.pth'},size=64", touch
-
-
-OWNERS = (sparsh, vjepa, t3, anytouch, anytouch2, unitouch, tvl, notebooks, cmc)
+OWNERS = (sparsh, vjepa, t3, anytouch, anytouch2, unitouch, tvl)

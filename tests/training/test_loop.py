@@ -121,12 +121,10 @@ def test_two_damaged_checkpoints_stop(pack: Pack, tmp_path: Path) -> None:
 @pytest.mark.parametrize("resume", [False, True])
 def test_killed_before_its_record_has_its_name(pack: Pack, straight: Path, tmp_path: Path, resume: bool) -> None:
     """The folder then holds nothing but a temporary file; a foreign file in it is still refused."""
-    ended = begin(int)
-    ended.join()
-    orphans = [f".run.json.{ended.pid}-7.tmp", f".log.jsonl.{files._HERE}-{ended.pid}-7.tmp"]
     (tmp_path / "r").mkdir()
-    for name in orphans:
-        (tmp_path / "r" / name).touch()
+    for name in ("run.json", "log.jsonl"):
+        (left := tmp_path / "r" / f".{name}.{'a' * 32}.tmp").touch()
+        os.utime(left, (0, 0))
     train(smoke(pack), tmp_path / "r", resume=resume, quiet=True)
     assert_equal_weights(straight, tmp_path / "r")
     assert not list((tmp_path / "r").glob(".*"))
@@ -137,17 +135,12 @@ def test_killed_before_its_record_has_its_name(pack: Pack, straight: Path, tmp_p
 
 
 def test_temporary_files_of_others_stay(tmp_path: Path) -> None:
-    """Of this process, of another machine, and of another file."""
-    ended = begin(int)
-    ended.join()
-    names = (
-        f".a.{files._HERE}-{os.getpid()}-1.tmp",
-        f".a.00000000-{ended.pid}-1.tmp",
-        f".b.{ended.pid}-1.tmp",
-        "a.tmp",
-    )
+    """Of a process that may still write, and of another file."""
+    names = (f".a.{'0' * 32}.tmp", f".b.{'1' * 32}.tmp", "a.tmp")
     for name in names:
         (tmp_path / name).touch()
+    for name in names[1:]:
+        os.utime(tmp_path / name, (0, 0))
     files.write_json(tmp_path / "a", 1)
     assert {path.name for path in tmp_path.iterdir()} == {*names, "a"}
 

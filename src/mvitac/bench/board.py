@@ -115,7 +115,6 @@ def gather(results: dict[str, dict[str, Any]]) -> Board:
 
 
 def _rows(task: str, by: str, records: list[dict[str, Any]], probe: str, ask: SuiteTask) -> list[Row]:
-    """The rows of one task, one for each modality."""
     records = [{**r, "source": GUESS} if r["source"] in ("majority", "mean") else r for r in records]
     found, cells = summarise(records, probe)[ask.name], by_cell(records, probe)
     shares = {}
@@ -185,7 +184,6 @@ def _text_table(intro: str, columns: Sequence[str], rows: Sequence[Sequence[str]
 
 
 def _scores(board: Board) -> list[Markup]:
-    """A table of all scores, and folded below it one of the errors of values in their units."""
     columns, rows, errors, above = [*board.encoders, *board.controls[::-1]], [], [], ""
     for row in board.rows:
         if row.task != above:
@@ -237,7 +235,6 @@ def _bars(board: Board, row: Row) -> Markup:
 
 
 def _few(board: Board, rows: Sequence[Row]) -> list[Markup]:
-    """A table of scores of linear probes fitted with some of the labels."""
     names = [*board.encoders, *board.controls[::-1]]
     found = []
     for row in rows:

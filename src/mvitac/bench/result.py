@@ -117,10 +117,7 @@ def read_result(path: Path) -> dict[str, Any]:
     if value.get("suite_digest") != suite.digest():
         raise ValueError(f"{path}: the suite inside does not have the digest that the file says: run the bench again")
     if suite.name in shipped() and find_suite(suite.name).digest() != suite.digest():
-        raise ValueError(
-            f"{path} is of another version of {suite.name} ({suite.digest()[:12]}, this version has"
-            f" {find_suite(suite.name).digest()[:12]}): run the bench again"
-        )
+        raise ValueError(f"{path} is of another version of {suite.name} than this one: run the bench again")
     now = {VERSION.sub("", name): name for name in shipped()}.get(VERSION.sub("", suite.name), suite.name)
     if now != suite.name:
         raise ValueError(f"{path} is of {suite.name}, this version has {now}: run the bench again")
@@ -144,7 +141,13 @@ def pinned_of(suite: Suite, block: dict[str, Any]) -> str:
 def problems(value: dict[str, Any]) -> list[str]:
     """What is missing in a result, or cannot be, in one line each: tasks, scores, controls, sums, data."""
     suite, encoder = suite_of(value), value["encoder"]
-    found = list(_of_encoder(encoder))
+    found = []
+    if encoder["name"] in (*CONTROLS, GUESS):
+        found.append(f"the encoder has the name of a control, {encoder['name']!r}: give --name")
+    if (seen := encoder["images_seen"]) is not None and not (isinstance(seen, int) and seen >= 0):
+        found.append(f"images_seen is {seen}")
+    if not len(encoder["seeds"]) == len(set(encoder["seeds"])) == len(encoder["weights"]):
+        found.append(f"has {len(encoder['weights'])} weights for seeds {encoder['seeds']}")
     asked = [(one, ask) for one in suite.sets for ask in one.tasks]
     if (want := [(s.name, t.name) for s, t in asked]) != (have := [(b["set"], b["task"]) for b in value["blocks"]]):
         return [*found, f"has the tasks {have}, the suite asks for {want}"]
@@ -152,15 +155,6 @@ def problems(value: dict[str, Any]) -> list[str]:
         if "not_run" not in block:
             found += [f"{one.name}, {ask.name}: {text}" for text in _of_block(block, suite, one, ask, encoder)]
     return found
-
-
-def _of_encoder(encoder: dict[str, Any]) -> Iterator[str]:
-    if encoder["name"] in (*CONTROLS, GUESS):
-        yield f"the encoder has the name of a control, {encoder['name']!r}: give --name"
-    if (seen := encoder["images_seen"]) is not None and not (isinstance(seen, int) and seen >= 0):
-        yield f"images_seen is {seen}"
-    if not len(encoder["seeds"]) == len(set(encoder["seeds"])) == len(encoder["weights"]):
-        yield f"has {len(encoder['weights'])} weights for seeds {encoder['seeds']}"
 
 
 def _of_block(

@@ -24,7 +24,7 @@ from mvitac.evaluation import few_labels
 from mvitac.evaluation.controls import Records, label_controls, pixel_controls
 from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import Scored, declared_leak, read_sources
-from mvitac.evaluation.probe import joined, names_in, probe_all, split_rows
+from mvitac.evaluation.probe import names_in, probe_all, split_rows
 from mvitac.evaluation.scores import pool
 from mvitac.model import Model
 from mvitac.system.files import digest, read_json, write_json
@@ -98,7 +98,7 @@ class Reader:
                 self.known[m] = self._all(m)
             own, z = self.known[m]
             parts.append(z[np.searchsorted(own, rows)])
-        return joined(parts)
+        return np.concatenate(parts, axis=1)
 
     def _all(self, modality: str) -> tuple[np.ndarray, np.ndarray]:
         """All rows of a modality that are needed, and their features; ValueError if these are no finite numbers."""
@@ -106,17 +106,10 @@ class Reader:
         asked = [(task, m) for ask, task in self.opened.tasks for m in ask.modalities if modality in names_in(m, pack)]
         rows = np.unique(np.concatenate([split_rows(v, task, m).all for v in self.opened.packs for task, m in asked]))
         parts = sensors(pack, modality, model.spec.channels(modality))
-        z = joined([features(model, part, modality, rows) for part in parts])
-        if z.ndim != 2 or len(z) != len(rows):
-            raise ValueError(
-                f"{self.name} gives features of shape {list(z.shape)} for {len(rows)} images of {modality}: give one"
-                " vector per image"
-            )
+        z = np.concatenate([features(model, part, modality, rows) for part in parts], axis=1)
         if bad := int((~np.isfinite(z).all(axis=1)).sum()):
-            raise ValueError(
-                f"{self.name} gives NaN or infinite features of {modality} for {bad} of {len(rows)} images: check its"
-                " weights and preprocessing"
-            )
+            what = f"NaN or infinite features of {modality} for {bad} of {len(rows)} images"
+            raise ValueError(f"{self.name} gives {what}: check its weights and preprocessing")
         return rows, z
 
     def score(self, suite: Suite, ask: SuiteTask, task: AnyTask, source: str, probes: Sequence[str]) -> Records:
@@ -204,7 +197,6 @@ def _controls(readers: Sequence[Reader], opened: Opened, suite: Suite, ask: Suit
 def _block(
     entry: Entry, one: SuiteSet, opened: Opened, ask: SuiteTask, task: AnyTask, own: Records, controls: Records
 ) -> dict[str, Any]:
-    """The scores of one task and what they were made on."""
     pack = opened.packs[0]
     why = {m: [misfit(entry.models[0], pack, each) for each in names_in(m, pack)] for m in ask.modalities}
     left_out = {m: next(filter(None, reasons)) for m, reasons in why.items() if any(reasons)}

@@ -4,7 +4,6 @@ A suite fixes data, rows, splits, probes, seeds and controls. Its digest covers 
 digests of the data that was measured. A definition that changes gets another name (sim-v3).
 """
 
-import copy
 import tomllib
 import typing
 from collections.abc import Sequence
@@ -13,7 +12,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import pyarrow as pa
 
 from mvitac.bench.external.base import parse
 from mvitac.data.joined_pack import JoinedPack
@@ -182,10 +180,8 @@ def open_set(one: SuiteSet, root: Path | None) -> Opened | str:
         packs = _fold(pack, one) if one.folds else (pack,)
         found = {"rows": _rows_digest(packs, [task for _, task in tasks]), **_image_digests(made)}
         if pinned(form, found) == "other rows" and form.at:
-            raise ValueError(
-                f"the data of {one.name} ({form.name}) has other rows, labels or splits than the suite: digest"
-                f" {found['rows'][:12]}, the suite has {form.pins['rows'][:12]}. Get the data again, or leave the set out"
-            )
+            why = f"other rows, labels or splits than the suite: digest {found['rows'][:12]}"
+            raise ValueError(f"the data of {one.name} ({form.name}) has {why}: get it again, or leave it out")
         return Opened(form.name, packs, tasks, found)
     places = " or ".join(dict.fromkeys(str((root or Path()) / p) for form in one.forms for p in form.at.values()))
     return f"{places} is not there" if root else f"no --data-root was given, where {places} would be"
@@ -210,16 +206,10 @@ def _fold(pack: Pack, one: SuiteSet) -> tuple[Pack, ...]:
         raise ValueError(f"{one.name} has {len(kept)} labelled groups, the suite asks for {one.folds} folds")
     strata = [_stratum(pack, tasks[one.tasks[0].name], groups == group) for group in kept]
     columns = folds(kept, strata, one.folds, one.val_every)
-    found = []
-    for column in columns.values():
-        side = dict(zip(kept, column, strict=True))
-        view = copy.copy(pack)
-        split = pa.array([side.get(group, "unlabelled") for group in groups.tolist()])
-        view.table = pack.table.set_column(pack.table.schema.get_field_index("split"), "split", split)
-        for cached in ("_answers", "hidden"):  # of another split
-            view.__dict__.pop(cached, None)
-        found.append(view)
-    return tuple(found)
+    sides = [dict(zip(kept, column, strict=True)) for column in columns.values()]
+    return tuple(
+        pack.with_splits({"split": [side.get(group, "unlabelled") for group in groups.tolist()]}) for side in sides
+    )
 
 
 def _stratum(pack: Pack, task: AnyTask, rows: np.ndarray) -> str:

@@ -13,8 +13,7 @@ from mvitac.evaluation.probe import Probe
 from mvitac.experiments.collect import outline
 from mvitac.experiments.cross_validation import gather_folds, lay_out_folds, together
 from mvitac.experiments.jobs import do_all
-from mvitac.experiments.paper_plans import PLANS, find_plan
-from mvitac.experiments.plan import Plan, setting
+from mvitac.experiments.plan import PLANS, Plan, find_plan, setting
 from mvitac.experiments.table_formats import write_tables
 from mvitac.recipes import RECIPES
 from mvitac.registry import default, to_json, unknown

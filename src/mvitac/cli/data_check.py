@@ -18,8 +18,7 @@ from mvitac.datasets.mix import open_packs
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.registry import default
-from mvitac.report.contact_sheet import suspicious
-from mvitac.report.image_grid import draw
+from mvitac.report.contact_sheet import draw, suspicious
 from mvitac.system.files import check_place, write_atomic
 
 _MANUAL = """Examine a dataset: unreadable, constant, swapped, mislabelled, copied, leaking, out of step, outside train.

@@ -15,7 +15,7 @@ from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.scores import summarise_again
 from mvitac.evaluation.sensors import RecolouredPack
 from mvitac.report.report import write_report
-from mvitac.report.tables import print_retrieval, print_sensors, print_summary
+from mvitac.report.tables import print_retrieval, print_summary
 from mvitac.system.files import read_json
 from mvitac.system.progress import shown
 
@@ -65,7 +65,8 @@ def probe(argv: list[str]) -> None:
     for line in about_lines(result["encoders"]):
         print(f"encoder: {line}", file=say)
     print_retrieval(result, say)
-    print_sensors(result, say)
+    for line in result.get("statistics", ()):
+        print(line, file=say)
     save_json(options.json, result, sealed=True)
 
 

@@ -10,7 +10,6 @@ a complete pack. If several processes want the same pack, one builds it and the 
 """
 
 import contextlib
-import hashlib
 import io
 import json
 import math
@@ -27,7 +26,7 @@ import pyarrow.parquet as pq
 
 from mvitac.data.pack import FORMAT, FORMAT_VERSION, Pack
 from mvitac.data.pack_table import check_table
-from mvitac.data.read_samples import Part, Reader, Stored, read_parts, stop_second_build, table_of
+from mvitac.data.read_samples import Part, Reader, read_parts, stop_second_build, table_of
 from mvitac.data.source import Source
 from mvitac.data.spec import QUALITY, SUFFIXES, DataSpec, Store, check_request, stored_as
 from mvitac.registry import to_json
@@ -38,8 +37,7 @@ from mvitac.system.progress import work as progress
 from mvitac.system.provenance import provenance
 
 NUM_PART_ROWS = 32  # the most that an interruption costs each process
-LIKELY_RATIO = 3
-"""Assumed compression ratio of JPEG. It is a low estimate: real frames have 4 at 64 px and 6 to 10 at 256 px."""
+LIKELY_RATIO = 3  # compression of JPEG; a low estimate: real frames have 4 at 64 px and 6 to 10 at 256 px
 
 
 def build(
@@ -77,33 +75,16 @@ def build(
     """
     stop_second_build()
     out = Path(out)
-    check_request(size, workers, max_damaged, store=store, quality=quality)
-    beside = [out.absolute().with_name(f"{out.absolute().name}{left}") for left in (".partial", ".lock")]
-    if not out.exists() or any(left.exists() for left in beside):
+    check_request(store, size=size, workers=workers, max_damaged=max_damaged, quality=quality)
+    if not out.exists():
         with hold_lock(out, f"{out} is being packed by another process: waiting for it", wait=True, quiet=quiet):
-            # What identifies a pack; it is kept in request.json and pack.json.
-            request = {"fingerprint": source.fingerprint(), "size": size, "spec": to_json(source.spec())}
-            request |= stored_as(store, quality)
             if not out.exists():
-                return _build(source, out, request, workers, max_damaged, quiet)
-            if _clean_up(out, request):
-                return Pack(out)
-    if exist_ok:
-        return Pack(out)
-    raise ValueError(f"{out} already exists: choose another --out, or delete it first")
-
-
-def _clean_up(out: Path, request: dict[str, Any]) -> bool:
-    """Delete what a killed build left beside the finished pack ``out``; return whether it was of the same request."""
-    partial = out.with_name(out.name + ".partial")
-    if (partial / "pack").exists():
-        return False
-    meta = read_json(out / "pack.json", "a pack's description")
-    if not isinstance(meta, dict) or {name: meta.get(name) for name in request} != json.loads(json.dumps(request)):
-        return False
-    if partial.exists():
-        shutil.rmtree(partial)
-    return True
+                # What identifies a pack; it is kept in request.json and pack.json.
+                request = {"fingerprint": source.fingerprint(), "size": size, "spec": to_json(source.spec())}
+                return _build(source, out, request | stored_as(store, quality), workers, max_damaged, quiet)
+    if not exist_ok:
+        raise ValueError(f"{out} already exists: choose another --out, or delete it first")
+    return Pack(out)
 
 
 def _build(source: Source, out: Path, request: dict[str, Any], workers: int, max_damaged: float, quiet: bool) -> Pack:
@@ -129,12 +110,10 @@ def _build(source: Source, out: Path, request: dict[str, Any], workers: int, max
             partial.append(part, stamp[part.first, part.end], stored)
             advance(part.end - part.first)
     partial.finish(len(items), max_damaged)
-    with contextlib.suppress(FileExistsError):
-        out.parent.mkdir(parents=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
     os.rename(partial.folder / "pack", out)
-    pack = Pack(out, verify=False)
     shutil.rmtree(partial.folder)
-    return pack
+    return Pack(out, verify=False)
 
 
 def _claim(partial: Path, request: dict[str, Any], sizes_at: str | None) -> None:
@@ -161,16 +140,14 @@ class _Partial:
     def __init__(self, folder: Path, spec: DataSpec, num: int, request: dict[str, Any]) -> None:
         """``num`` is the number of rows if nothing is damaged."""
         self.folder, self.spec, self.num, self.request = folder, spec, num, request
-        self.store, size = request["store"], request["size"]
         self.list = folder / "parts.jsonl"
-        self.shapes = {m: (size, size, spec.channels(m)) for m in spec.modalities}
-        self.files = {m: folder / "pack" / f"{m}{SUFFIXES[self.store]}" for m in spec.modalities}
-        self.sums = {m: hashlib.sha256(self._header(m, num)) for m in spec.modalities}
+        self.shapes = {m: (request["size"], request["size"], spec.channels(m)) for m in spec.modalities}
+        self.files = {m: folder / "pack" / f"{m}{SUFFIXES[request['store']]}" for m in spec.modalities}
         self.parts: list[Part] = []
 
     def _header(self, modality: str, num: int) -> bytes:
-        """Return the .npy header of ``num`` rows; numpy pads it, so its length does not depend on ``num``."""
-        if self.store == "jpeg":
+        """The .npy header of ``num`` rows; numpy pads it, so its length does not depend on ``num``."""
+        if self.request["store"] == "jpeg":
             return b""
         buffer, shape = io.BytesIO(), (num, *self.shapes[modality])
         np.lib.format.write_array_header_1_0(buffer, {"descr": "|u1", "fortran_order": False, "shape": shape})
@@ -178,13 +155,12 @@ class _Partial:
 
     def _write_headers(self, num: int) -> None:
         for modality, path in self.files.items():
-            if header := self._header(modality, num):
-                with naming(path), path.open("r+b") as file:
-                    file.write(header)
+            with naming(path), path.open("r+b") as file:
+                file.write(self._header(modality, num))
 
     def check_disk(self) -> str:
         """Return a text with the disk space needed and available; ValueError if it is not enough."""
-        share = 1 if self.store == "raw" else LIKELY_RATIO
+        share = 1 if self.request["store"] == "raw" else LIKELY_RATIO
         whole = sum(len(self._header(m, 0)) + self.num * math.prod(shape) // share for m, shape in self.shapes.items())
         need = max(0, whole - sum(path.stat().st_size for path in self.files.values() if path.exists()))
         parent = next(p for p in self.folder.absolute().parents if p.exists())
@@ -203,71 +179,47 @@ class _Partial:
         for path in (self.list, *self.files.values()):
             path.touch()
         kept, ends = 0, {m: len(self._header(m, 0)) for m in self.files}
-        lines = self.list.read_bytes().splitlines(keepends=True)
-        for line, wanted in zip(lines, expected, strict=False):
-            found = self._on_disk(line, wanted, ends)
-            if found is None:
+        for line, wanted in zip(self.list.read_bytes().splitlines(keepends=True), expected, strict=False):
+            part = _part_of(line, wanted)
+            if part is None or not all(self._is_whole(part, m, end) for m, end in ends.items()):
                 break
-            part, stored = found
-            self._add(part, stored)
+            self.parts.append(part)
             kept += len(line)
-            ends = {m: end + len(stored[m]) for m, end in ends.items()}
+            ends = {m: end + sum(part.bytes[m]) for m, end in ends.items()}
         os.truncate(self.list, kept)
         for modality, path in self.files.items():
             os.truncate(path, ends[modality])
         self._write_headers(self.num)
         return len(self.parts)
 
-    def _on_disk(
-        self, line: bytes, wanted: tuple[int, int, str | None], starts: dict[str, int]
-    ) -> tuple[Part, Stored] | None:
-        """Return the part of a ``line`` of the list and its images, which begin at ``starts``; None if it is not whole."""
-        with contextlib.suppress(ValueError, KeyError, TypeError):
-            known = json.loads(line)
-            if not line.endswith(b"\n") or (known["first"], known["end"], known.pop("stamp")) != wanted:
-                return None
-            part, stored = Part(**known), {}
-            for modality, path in self.files.items():
-                with path.open("rb") as file:
-                    file.seek(starts[modality])
-                    images = [file.read(length) for length in part.bytes[modality]]
-                if [zlib.crc32(image) for image in images] != part.crc[modality]:
-                    return None
-                stored[modality] = b"".join(images)
-            return part, stored
-        return None
+    def _is_whole(self, part: Part, modality: str, start: int) -> bool:
+        """Whether the images of ``part``, which begin at ``start`` of their file, have their checksums."""
+        with self.files[modality].open("rb") as file:
+            file.seek(start)
+            return [zlib.crc32(file.read(length)) for length in part.bytes[modality]] == part.crc[modality]
 
-    def _add(self, part: Part, stored: Stored) -> None:
-        self.parts.append(part)
-        for modality, images in stored.items():
-            self.sums[modality].update(images)
-
-    def append(self, part: Part, stamp: str | None, stored: Stored) -> None:
+    def append(self, part: Part, stamp: str | None, stored: dict[str, bytes]) -> None:
         """Write the images of ``part`` to the files, then the part to the list, without fsync: ``resume`` checks them."""
         for modality, images in stored.items():
             _append(self.files[modality], images)
         _append(self.list, json.dumps({**vars(part), "stamp": stamp}).encode() + b"\n")
-        self._add(part, stored)
+        self.parts.append(part)
 
     def finish(self, num_items: int, max_damaged: float) -> None:
         """Complete the pack in the folder ``pack``."""
         folder, num = self.folder / "pack", sum(len(part.columns) for part in self.parts)
         damaged = self._check_damage(num_items, num, max_damaged)
-        digests = {path.name: self.sums[m].hexdigest() for m, path in self.files.items()}
-        if num != self.num and self.store == "raw":
-            self._write_headers(num)
-            digests = {path.name: digest_file(path) for path in self.files.values()}
+        self._write_headers(num)
         for path in folder.iterdir():  # left by a build that was killed here
-            if path.name not in digests:
+            if path not in self.files.values():
                 path.unlink()
-        table = io.BytesIO()
-        pq.write_table(self._table(), table)
-        write_atomic(folder / "samples.parquet", lambda file: file.write(table.getvalue()))
+        table = self._table()
+        write_atomic(folder / "samples.parquet", lambda file: pq.write_table(table, file))
         meta = {
             "format": FORMAT,
             "format_version": FORMAT_VERSION,
             "num": num,
-            "digests": {"samples.parquet": hashlib.sha256(table.getvalue()).hexdigest(), **digests},
+            "digests": {path.name: digest_file(path) for path in (folder / "samples.parquet", *self.files.values())},
             "damaged": damaged,
             **self.request,
         }
@@ -276,7 +228,7 @@ class _Partial:
         write_json(folder / "provenance.json", provenance())
 
     def _check_damage(self, num_items: int, num: int, max_damaged: float) -> list[list[str]]:
-        """Return name and reason of everything that could not be read; ValueError if it is more than ``max_damaged``."""
+        """Name and reason of everything that could not be read; ValueError if it is more than ``max_damaged``."""
         damaged = [one for part in self.parts for one in part.damaged]
         lost = [one for part in self.parts for one in part.lost]
         if len(damaged) > max_damaged * num_items or len(lost) > max_damaged * (num + len(lost)):
@@ -286,18 +238,15 @@ class _Partial:
             write_atomic(self.list, lambda file: file.write(b"".join(lines)))
             what = f"{len(damaged)} of {num_items} items" if damaged else f"{len(lost)} of {num + len(lost)} samples"
             first = ": ".join((damaged or lost)[0])
-            raise ValueError(
-                f"{what} cannot be read, first {first}"
-                " (repair it, or leave a share of them out: mvitac data pack --max-damaged SHARE)"
-            )
+            raise ValueError(f"{what} cannot be read, first {first} (repair it, or give data pack --max-damaged SHARE)")
         if not num:
             raise ValueError("every item is damaged: nothing to pack")
         return [*damaged, *lost]
 
     def _table(self) -> pa.Table:
-        """Return the table of the pack, with a checksum (and the length of a JPEG) per image."""
+        """The table of the pack, with a checksum (and the length of a JPEG) per image."""
         table = table_of([row for part in self.parts for row in part.columns])
-        for kind in ("crc", "bytes") if self.store == "jpeg" else ("crc",):
+        for kind in ("crc", "bytes") if self.request["store"] == "jpeg" else ("crc",):
             for modality in self.files:
                 name = f"{kind}_{modality}"
                 # A manifest that was made from another pack has these columns already.
@@ -306,3 +255,12 @@ class _Partial:
                 table = table.append_column(name, pa.array(numbers, pa.uint32()))
         check_table(table, self.spec)
         return table
+
+
+def _part_of(line: bytes, wanted: tuple[int, int, str | None]) -> Part | None:
+    """The part of a ``line`` of the list; None if it was cut off or is not the ``wanted`` one."""
+    with contextlib.suppress(ValueError, KeyError, TypeError):
+        known = json.loads(line)
+        if line.endswith(b"\n") and (known["first"], known["end"], known.pop("stamp")) == wanted:
+            return Part(**known)
+    return None

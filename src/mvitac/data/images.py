@@ -104,6 +104,11 @@ def to_rgb(image: Image.Image) -> Image.Image:
     return image if image.mode == "RGB" else image.convert("RGB")
 
 
+def side_by_side(image: np.ndarray) -> np.ndarray:
+    """Sensors stacked on channels, uint8 [H, W, 3 n], next to each other: [H, n W, 3]."""
+    return np.concatenate([image[..., c : c + 3] for c in range(0, image.shape[2], 3)], axis=1)
+
+
 def difference(image: np.ndarray, background: np.ndarray) -> np.ndarray:
     """Return (image - background) / 2 + 128 as uint8, so that no contact is 128."""
     if image.shape != background.shape:

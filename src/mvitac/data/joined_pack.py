@@ -52,10 +52,8 @@ class JoinedPack(Several):
         )
         self._open([learn, score])
         if found := self._shared():
-            raise ValueError(
-                f"{found[0]} is learned from in {learn.path} and scored in {score.path}, one of {found[1]}: give packs"
-                " whose splits agree, or leave these rows out"
-            )
+            where = f"is learned from in {learn.path} and scored in {score.path}, one of {found[1]}"
+            raise ValueError(f"{found[0]} {where}: give packs whose splits agree")
 
     def _shared(self) -> tuple[str, int] | None:
         """A group or an image that probes learn from and are scored on, and how many there are."""
@@ -70,7 +68,6 @@ class JoinedPack(Several):
 
 
 def _common_tasks(learn: Pack, score: Pack) -> dict[str, AnyTask]:
-    """Return the tasks that both packs have by name, as defined by ``learn``."""
     known = {task.name: task for task in learn.spec.all_tasks}
     tasks = [(known[task.name], task) for task in score.spec.all_tasks if task.name in known]
     if not tasks:

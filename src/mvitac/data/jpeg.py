@@ -61,10 +61,6 @@ class Jpegs(Lazy):
             raise ValueError(f"{path} holds {held} bytes, its table promises {self._ends[-1]}")
         self._file = np.memmap(path, np.uint8, "r") if held else np.zeros(0, np.uint8)  # an empty file cannot be mapped
 
-    def jpeg(self, row: int) -> bytes:
-        """Return the stored bytes of ``row``."""
-        return self._file[self._ends[row] : self._ends[row + 1]].tobytes()
-
     def _made(self, rows: np.ndarray) -> np.ndarray:
         images = np.empty((len(rows), *self.shape[1:]), np.uint8)
         if len(rows) <= FEW or (num := _num_threads()) == 1:
@@ -75,10 +71,9 @@ class Jpegs(Lazy):
         return images
 
     def _decode(self, rows: np.ndarray, images: np.ndarray) -> None:
-        """Decode ``rows`` into ``images``."""
         for i, row in enumerate(rows.tolist()):
             try:
-                images[i] = decode(self.jpeg(row), self.shape[1:])
+                images[i] = decode(self._file[self._ends[row] : self._ends[row + 1]].tobytes(), self.shape[1:])
             except ValueError as error:
                 raise ValueError(
                     f"{self.path}: row {row} cannot be decoded ({brief(error)}): the pack is damaged, make it again"

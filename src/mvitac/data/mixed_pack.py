@@ -1,6 +1,5 @@
 """Several packs as one training set: other datasets, sensors, image sizes and missing modalities."""
 
-import copy
 import functools
 import itertools
 import re
@@ -12,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from mvitac.data.pack import Pack
-from mvitac.data.row_hashes import image_sums, number_hint, row_hashes
+from mvitac.data.row_hashes import image_sums, row_hashes
 from mvitac.data.several import Columns, Several, columns_of_part, known_image, text
 from mvitac.data.spec import MODALITIES, AnyTask, DataSpec, Task, ValueTask
 from mvitac.system.files import digest
@@ -101,12 +100,9 @@ class MixedPack(Several):
 
     def alone(self, part: str) -> Pack:
         """This pack with the rows of all other parts hidden, and the modalities of ``part``."""
-        made, own = copy.copy(self), self.parts[part].spec
-        made.__dict__.pop("_answers", None)  # labels by split, of all parts
         inside = self.part_of == list(self.parts).index(part)
-        splits = pa.array(np.where(inside, self.column("split").astype(str), "hidden"))
-        made.table = self.table.set_column(self.table.schema.get_field_index("split"), "split", splits)
-        lacking = {f"{m}_channels": 0 for m in self.spec.modalities if m not in own.modalities}
+        made = self.with_splits({"split": np.where(inside, self.column("split").astype(str), "hidden")})
+        lacking = {f"{m}_channels": 0 for m in self.spec.modalities if m not in self.parts[part].spec.modalities}
         made.spec = replace(self.spec, **lacking)
         return made
 
@@ -146,8 +142,7 @@ def _shared(parts: Mapping[str, Pack]) -> str:
             both = scored[np.isin(theirs[scored], ours[learned])]
             if len(both):
                 by = other.spec.group_by if column == "group" else "row"
-                hint = number_hint(one.spec.name, other) if column == "id" else ""
-                return f"{by} {str(other.column(column)[both[0]])!r} {where} {len(np.unique(theirs[both]))}{hint}"
+                return f"{by} {str(other.column(column)[both[0]])!r} {where} {len(np.unique(theirs[both]))}"
         if found := known_image(other, scored, image_sums(one)[learned]):
             return f"{found[0]} {where} {found[1]}"
     return ""
@@ -257,7 +252,6 @@ def _mixed_table(parts: Mapping[str, Pack], columns: Renamed, tasks: _Tasks) -> 
 
 
 def _mixed_spec(parts: Mapping[str, Pack], tasks: _Tasks, channels: Mapping[str, int], notes: list[str]) -> DataSpec:
-    """The description of all parts together."""
     specs = {name: pack.spec for name, pack in parts.items()}
     units = {spec.group_by for spec in specs.values()}
     return DataSpec(

@@ -10,10 +10,10 @@ A pack stored as JPEG has ``vision.jpegs`` and ``touch.jpegs`` instead (``data/j
 This module opens and checks packs; ``data/build.py`` builds them.
 """
 
+import copy
 import functools
 import warnings
-import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -67,8 +67,8 @@ class Pack:
         self.table: pa.Table = self._read_table()
         read = {"raw": self._map, "jpeg": self._jpegs}[self.store]
         self.images: dict[str, Images] = {m: read(m, self._file(name)) for name, m in files.items()}
-        for name, modality in files.items() if verify else ():
-            self._check_digest(name, modality)
+        for name in files if verify else ():
+            self._check_digest(name)
 
     def _read_meta(self) -> dict[str, Any]:
         """Return the content of pack.json; ValueError unless it describes a pack that this version reads."""
@@ -85,7 +85,6 @@ class Pack:
         return meta
 
     def _read_table(self) -> pa.Table:
-        """Return the content of samples.parquet, checked."""
         self._check_digest("samples.parquet")
         path = self._file("samples.parquet")
         try:
@@ -183,6 +182,16 @@ class Pack:
             mask &= self.column(name).astype(str) == value
         return np.flatnonzero(mask)
 
+    def with_splits(self, splits: "Mapping[str, Iterable[str]]") -> "Pack":
+        """This pack with other cells in columns of splits."""
+        made = copy.copy(self)
+        for cached in ("_answers", "hidden"):  # of the other split
+            made.__dict__.pop(cached, None)
+        for name, cells in splits.items():
+            column = pa.array(list(cells), pa.string())
+            made.table = made.table.set_column(made.table.schema.get_field_index(name), name, column)
+        return made
+
     @functools.cached_property
     def touch_groups(self) -> np.ndarray:
         """int64 [N], number of each row's touch group (column touch_group, else group): its rows are near-duplicates."""
@@ -249,22 +258,9 @@ class Pack:
             self._rows_by[of] = np.split(order, np.cumsum(np.bincount(numbers))[:-1])
         return self._rows_by[of][number]
 
-    def _check_digest(self, name: str, modality: str = "") -> None:
+    def _check_digest(self, name: str) -> None:
         if digest_file(self._file(name)) != self.digests[name]:
-            where = self._damaged_rows(modality, self.images[modality]) if modality else ""
-            raise ValueError(f"{self.path / name} does not match its digest{where}: the pack is damaged, make it again")
-
-    def _damaged_rows(self, modality: str, images: Images) -> str:
-        """Return a text naming the rows that do not match their checksums."""
-        if f"crc_{modality}" not in self.table.column_names:
-            return ""
-        sums = self.table.column(f"crc_{modality}").to_pylist()
-        stored: Any = images.jpeg if isinstance(images, Jpegs) else images.__getitem__
-        rows = [i for i in range(len(images)) if zlib.crc32(stored(i)) != sums[i]]
-        if not rows:
-            return " in its header"
-        name = self.table.column("id")[rows[0]].as_py()
-        return f" in {len(rows)} of {len(images)} rows, first row {rows[0]} (id {name!r})"
+            raise ValueError(f"{self.path / name} does not match its digest: the pack is damaged, make it again")
 
     def _file(self, name: str) -> Path:
         path = self.path / name

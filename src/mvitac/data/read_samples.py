@@ -27,26 +27,15 @@ from mvitac.system.malloc import keep_freed_memory
 
 @dataclass
 class Part:
-    """A few items of a source, read: their rows as they are stored."""
+    """The items ``first`` to ``end`` of a source, read: their rows as they are stored. By modality, each row's image."""
 
     first: int
-    """Number of the first item."""
     end: int
-    """Number of the item after the last one."""
-    columns: list[dict[str, Any]] = field(default_factory=list)
-    """Of each row."""
-    damaged: list[list[str]] = field(default_factory=list)
-    """Name and reason of each item that cannot be read."""
-    lost: list[list[str]] = field(default_factory=list)
-    """Name and reason of each sample that cannot be read."""
-    crc: dict[str, list[int]] = field(default_factory=dict)
-    """Modality -> checksum of each row's image as stored."""
-    bytes: dict[str, list[int]] = field(default_factory=dict)
-    """Modality -> length of each row's image as stored."""
-
-
-Stored = dict[str, bytes]
-"""Modality -> the images of a part as stored, one after another."""
+    columns: list[dict[str, Any]] = field(default_factory=list)  # of each row
+    damaged: list[list[str]] = field(default_factory=list)  # name and reason of each item that cannot be read
+    lost: list[list[str]] = field(default_factory=list)  # the same of samples
+    crc: dict[str, list[int]] = field(default_factory=dict)  # checksum of each row's image as stored
+    bytes: dict[str, list[int]] = field(default_factory=dict)  # its length
 
 
 @dataclass(frozen=True)
@@ -57,10 +46,10 @@ class Reader:
     spec: DataSpec
     items: Sequence[str]
     size: int
-    quality: int | None
-    """Of JPEGs; None: raw pixels."""
+    quality: int | None  # of JPEGs; None: raw pixels
 
-    def __call__(self, first: int, end: int) -> tuple[Part, Stored]:
+    def __call__(self, first: int, end: int) -> tuple[Part, dict[str, bytes]]:
+        """Read a part; also its images as stored, one after another, by modality."""
         part = Part(first, end)
         stored: dict[str, list[bytes]] = {modality: [] for modality in self.spec.modalities}
         for number in range(first, end):
@@ -108,7 +97,9 @@ def table_of(columns: Sequence[dict[str, Any]]) -> pa.Table:
     return pa.table(arrays)
 
 
-def read_parts(reader: Reader, parts: Sequence[tuple[int, int]], workers: int) -> Iterator[tuple[Part, Stored]]:
+def read_parts(
+    reader: Reader, parts: Sequence[tuple[int, int]], workers: int
+) -> Iterator[tuple[Part, dict[str, bytes]]]:
     """Yield the parts (first item, end), in order, read by ``workers`` processes; 0 = one per core."""
     workers = workers or os.cpu_count() or 1
     if workers == 1 or len(parts) < 2:
@@ -117,7 +108,7 @@ def read_parts(reader: Reader, parts: Sequence[tuple[int, int]], workers: int) -
         return
     # spawn: a forked child may inherit locks held by torch. Starting a worker is cheap, because it does not import torch.
     context = multiprocessing.get_context("spawn")
-    ahead: deque[Future[tuple[Part, Stored]]] = deque()
+    ahead: deque[Future[tuple[Part, dict[str, bytes]]]] = deque()
     with (
         tempfile.NamedTemporaryFile(prefix="mvitac-") as file,
         ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(file.name,)) as pool,
@@ -150,7 +141,7 @@ def _start_worker(file: str) -> None:
     _reader = pickle.loads(Path(file).read_bytes())
 
 
-def _read_here(first: int, end: int) -> tuple[Part, Stored]:
+def _read_here(first: int, end: int) -> tuple[Part, dict[str, bytes]]:
     return _reader(first, end)
 
 

@@ -56,16 +56,6 @@ def known_images(pack: Pack, rows: np.ndarray, known: np.ndarray) -> np.ndarray:
     return same
 
 
-def number_hint(name: str, pack: Pack) -> str:
-    """What to do if rows of ``pack`` are taken for those of other data of this ``name``; "" if that cannot be.
-
-    Rows without an id have their number as one.
-    """
-    if pack.spec.name != name or not all(text.isdigit() for text in pack.own_ids.tolist()):
-        return ""
-    return f" (rows without an id are compared by number: if these are other data than {name!r}, pack with another --title)"
-
-
 def _hash(texts: np.ndarray, name: str, weak: bool) -> np.ndarray:
     unique, inverse = np.unique(texts, return_inverse=True)
     named = (f"{name}/{text}" if weak or text.isdigit() else text for text in unique.tolist())

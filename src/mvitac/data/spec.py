@@ -162,20 +162,17 @@ class DataSpec:
         return tuple(m for m in MODALITIES if self.channels(m))
 
 
-def check_request(
-    size: int, workers: int, max_damaged: float = 0.0, *, store: str = "raw", quality: int = QUALITY
-) -> None:
+LIMITS = {"size": (8, 1024), "workers": (0, 1024), "max_damaged": (0, 1), "quality": (1, 100)}
+
+
+def check_request(store: str = "raw", **given: float) -> None:
     """Raise ValueError for invalid packing options."""
-    if not 8 <= size <= 1024:
-        raise ValueError(f"size {size} is not possible: give the stored side in pixels, 8 to 1024")
-    if not 0 <= workers <= 1024:
-        raise ValueError(f"workers {workers} is not possible: give 1 to 1024 processes, or 0 for one per core")
-    if not 0 <= max_damaged <= 1:
-        raise ValueError(f"max_damaged {max_damaged} is not possible: give a fraction of the items, 0 to 1")
+    for name, value in given.items():
+        low, high = LIMITS[name]
+        if not low <= value <= high:
+            raise ValueError(f"{name} {value} is not possible: give {low} to {high}")
     if store not in SUFFIXES:
         raise unknown("store", str(store), SUFFIXES)
-    if not 1 <= quality <= 100:
-        raise ValueError(f"quality {quality} is not possible: give a JPEG quality from 1 to 100")
 
 
 def stored_as(store: Store, quality: int) -> dict[str, Any]:

@@ -7,12 +7,14 @@ runs, so a few touches in an hour of video are cheap.
 
 import contextlib
 import functools
+import itertools
 import os
 import sys
 from bisect import bisect_left, insort
+from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import av
 import numpy as np
@@ -28,8 +30,7 @@ from mvitac.system.files import brief
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg")
 
 
-@dataclass(frozen=True)
-class Packets:
+class Packets(NamedTuple):
     """The packet table of a video, in the order in which packets are stored and decoded.
 
     Packets cut off by an edit list (a trim without re-encoding) are decoded, because others refer to them, but not
@@ -48,7 +49,7 @@ class Packets:
         return int(self.before[-1])
 
     def start_of(self, frame: int) -> int:
-        """Return the index in ``keys`` of the last key packet with at most ``frame`` frames stored before it."""
+        """The index in ``keys`` of the last key packet with at most ``frame`` frames stored before it."""
         return max(0, int(np.searchsorted(self.before[self.keys], frame, side="right")) - 1)
 
 
@@ -84,73 +85,38 @@ def frames(
     ``lost`` receives the reason for each frame that is missing or damaged; without it, such a frame is a ValueError.
     OSError if the file cannot be read.
     """
-    pending = _Pending(path, wanted, lost)
+    left, packets = deque(sorted({int(i) for i in wanted})), _packets(path)
+    if left and left[0] < 0:
+        raise ValueError(f"{path}: frame {left[0]} is wanted: frames are counted from 0")
+
+    def lose(why: str) -> None:
+        if lost is None:
+            raise ValueError(f"{path}: frame {left[0]} {why}")
+        lost[left.popleft()] = why
+
     with _opened(path) as (container, stream):
         reformatter = VideoReformatter()  # keeps its tables from frame to frame
-        key = 0
-        while pending:
-            if pending.next >= pending.packets.num:
-                pending.lose()
-                continue
-            key = max(key, pending.packets.start_of(pending.next))
-            run = _Run(container, stream, pending.packets, key)
-            if run.first > pending.next and key:  # the key frame is displayed after the frame that depends on it
-                run = _Run(container, stream, pending.packets, key - 1)
+        while left and left[0] < packets.num:
+            key = packets.start_of(left[0])
+            run = _Run(container, stream, packets, key)
+            if run.first > left[0] and key:  # the key frame is displayed after the frame that depends on it
+                run = _Run(container, stream, packets, key - 1)
             for number, frame in run.frames():
-                if pending.take(number, run.trouble):
+                while left and (left[0] < number or (left[0] == number and run.trouble)):
+                    lose(f"cannot be decoded ({run.trouble or 'nothing came out'}): fetch the video again")
+                if left and left[0] == number:
                     # Bilinear as Pillow's resize (every source pixel counts), but directly from the decoder's planes.
                     shape = {"width": size or frame.width, "height": size or frame.height}
                     rgb = reformatter.reformat(frame, format="rgb24", interpolation=Interpolation.BILINEAR, **shape)
-                    yield number, rgb.to_ndarray()
-                if not pending or pending.is_nearer_from(key, run.fed):
-                    break
+                    yield left.popleft(), rgb.to_ndarray()
+                ahead = packets.start_of(left[0]) if left else key
+                if not left or (ahead > key and packets.keys[ahead] > run.fed + 1):
+                    break  # nothing more is wanted, or a later key packet is nearer than the next packet
             else:
-                while pending:
-                    pending.lose()
-
-
-class _Pending:
-    """The wanted frames of a video that have not been reached yet."""
-
-    def __init__(self, path: str | Path, wanted: Iterable[int], lost: dict[int, str] | None) -> None:
-        self._path, self._lost = path, lost
-        self._numbers = sorted({int(i) for i in wanted}, reverse=True)  # the next one is the last
-        if self._numbers and self.next < 0:
-            raise ValueError(f"{path}: frame {self.next} is wanted: frames are counted from 0")
-        self.packets = _packets(path)
-
-    def __bool__(self) -> bool:
-        return bool(self._numbers)
-
-    @property
-    def next(self) -> int:
-        return self._numbers[-1]
-
-    def take(self, number: int, trouble: str) -> bool:
-        """Return whether frame ``number`` is wanted and good; frames before it, and it if ``trouble``, are lost."""
-        while self._numbers and self.next < number:
-            self.lose(f"cannot be decoded ({trouble or 'nothing came out'}): fetch the video again")
-        if not self._numbers or self.next != number:
-            return False
-        if trouble:
-            self.lose(f"cannot be decoded ({trouble}): fetch the video again")
-            return False
-        self._numbers.pop()
-        return True
-
-    def is_nearer_from(self, key: int, fed: int) -> bool:
-        """Return whether the next frame is reached sooner from a later key packet than from packet ``fed``."""
-        ahead = self.packets.start_of(self.next)
-        return ahead > key and self.packets.keys[ahead] > fed + 1
-
-    def lose(self, why: str = "is beyond the end of what can be read: the file is cut off, fetch it again") -> None:
-        """Give up the next frame."""
-        frame = self._numbers.pop()
-        if frame >= self.packets.num:
-            why = f"is wanted, the video ends after frame {self.packets.num - 1}: is it the right one, and whole?"
-        if self._lost is None:
-            raise ValueError(f"{self._path}: frame {frame} {why}")
-        self._lost[frame] = why
+                while left and left[0] < packets.num:
+                    lose("is beyond the end of what can be read: the file is cut off, fetch it again")
+        while left:
+            lose(f"is wanted, the video ends after frame {packets.num - 1}: is it the right one, and whole?")
 
 
 class _Run:
@@ -162,7 +128,10 @@ class _Run:
         self.fed = int(packets.keys[key])  # number of the packet given to the decoder last
         self.trouble = ""  # error in the stream that affects frames up to the next key frame; "" = none
         self._hurt = 0  # display time of the damaged frame
-        self._demuxed = _from(container, stream, int(packets.dts[self.fed]))
+        dts = int(packets.dts[self.fed])
+        container.seek(dts, stream=stream, backward=True)
+        found = itertools.dropwhile(lambda packet: packet.dts != dts, container.demux(stream))
+        self._demuxed = (packet for packet in found if packet.size)
         # Frames displayed before a key frame may be stored directly after it. They refer to packets before the key
         # frame, so they belong to the previous run. Their number determines the frame number of the key frame.
         self._ahead: list[Packet] = []
@@ -172,8 +141,8 @@ class _Run:
                 break
         self._shown = _shown(self._ahead[0]) if self._ahead else 0
         leading = sum(_shown(p) < self._shown and not p.is_discard for p in self._ahead)
+        # Frame number of the key frame or, if that is cut off, of the first frame after it.
         self.first = int(packets.before[self.fed]) + leading
-        """Frame number of the key frame or, if that is cut off, of the first frame after it."""
 
     def frames(self) -> Iterator[tuple[int, VideoFrame]]:
         """Yield (frame number, frame) in display order, from the key frame to the end of the file."""
@@ -191,11 +160,10 @@ class _Run:
                     yield self.first + bisect_left(due, frame.pts), frame
 
     def _is_next(self, packet: Packet) -> bool:
-        """Return whether ``packet`` is number ``fed``: after damage, a demuxer may silently skip packets."""
+        """Whether ``packet`` is number ``fed``: after damage, a demuxer may silently skip packets."""
         if self.fed >= len(self._packets.places) or packet.pos is None:
             return False
-        # With or without the header of an AVI chunk.
-        return packet.pos - int(self._packets.places[self.fed]) in {0, 8}
+        return packet.pos - int(self._packets.places[self.fed]) in {0, 8}  # 8: without the header of an AVI chunk
 
     def _all(self) -> Iterator[Packet | None]:
         yield from self._ahead
@@ -223,21 +191,11 @@ class _Run:
 
 
 def _shown(packet: Packet) -> int:
-    """Return the display time of a packet's frame, in the stream's time base."""
+    """The display time of a packet's frame, in the stream's time base."""
     time = packet.pts if packet.pts is not None else packet.dts
     if time is None:
         raise ValueError("its frames carry no times: convert it, e.g. with ffmpeg -i IN -c:v copy OUT.mp4")
     return time
-
-
-def _from(container: InputContainer, stream: VideoStream, dts: int) -> Iterator[Packet]:
-    """Yield the packets from the one with decoding time ``dts``."""
-    container.seek(dts, stream=stream, backward=True)
-    found = False
-    for packet in container.demux(stream):
-        found = found or packet.dts == dts
-        if found and packet.size:
-            yield packet
 
 
 @contextlib.contextmanager

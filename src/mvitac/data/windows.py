@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-import pyarrow as pa
 
 from mvitac.data.images import difference
 from mvitac.data.lazy import Lazy
@@ -37,17 +36,14 @@ def windowed(pack: Pack, window: Window) -> Pack:
         if modality not in pack.spec.modalities:
             raise unknown("modality of windows", modality, pack.spec.modalities)
     index, whole, first = frames_of(pack, window)
-    made = copy.copy(pack)
+    kept: dict[str, list[str]] = {}
+    for name in pack.spec.split_columns if window.short == "leave-out" else ():
+        kept[name] = [split if full else "hidden" for split, full in zip(pack.column(name), whole, strict=True)]
+    made = pack.with_splits(kept)
     made.spec = replace(pack.spec, window=replace(window, order=places(pack, window)[0]))
-    for name in ("_answers", "hidden"):
-        made.__dict__.pop(name, None)  # kept from before rows were left out
     made.digests = {**pack.digests, "window": digest([window.frames, window.stride, *window.of, window.minus_first])}
     rest = first if window.minus_first else None
     made.images = {m: Windows(pack.images[m], index, rest) if m in window.of else pack.images[m] for m in pack.images}
-    if window.short == "leave-out":
-        for name in pack.spec.split_columns:
-            kept = [split if full else "hidden" for split, full in zip(pack.column(name), whole, strict=True)]
-            made.table = made.table.set_column(made.table.schema.get_field_index(name), name, pa.array(kept))
     return made
 
 
@@ -91,30 +87,20 @@ def frames_of(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray, np.nd
         times = place[rows]
         if (same := np.diff(times) == 0).any():
             at = times[int(np.flatnonzero(same)[0])]
-            raise ValueError(
-                f"frames: two rows of touch {_touch(pack, rows)!r} have {name} {at:g}: name the column of the recording"
-                " with --touch-group when the data is packed, or another column with --data.order"
-            )
+            raise ValueError(f"two rows of touch {_touch(pack, rows)!r} have {name} {at:g}: name another --data.order")
         if window.frames > 1 and len(times) > 2 and (step := np.median(np.diff(times))) > 1.25 * window.stride:
-            raise ValueError(
-                f"frames: stride {window.stride:g} is shorter than the distance of frames in touch"
-                f" {_touch(pack, rows)!r}, {step:g} (column {name}), so a frame would be shown twice: give a stride of at"
-                " least the longest distance, or another column with --data.order"
-            )
+            far = f"the distance of frames in touch {_touch(pack, rows)!r}, {step:g} (column {name})"
+            raise ValueError(f"stride {window.stride:g} is shorter than {far}: a frame would be shown twice")
         asked = times[:, None] - back  # the newest frame that is old enough, else the first
         index[rows] = rows[np.maximum(np.searchsorted(times, asked + 1e-9, side="right") - 1, 0)]
         whole[rows] = asked[:, -1] >= times[0] - 1e-9
         first[rows] = rows[0]
     if not whole.any():
-        raise ValueError(
-            f"frames {window.frames} at stride {window.stride:g} are longer than every touch of {pack.spec.name!r}: give"
-            " fewer frames or a smaller stride"
-        )
+        raise ValueError(f"frames {window.frames} at stride {window.stride:g} are longer than every touch: give fewer")
     return index, whole, first
 
 
 def _touch(pack: Pack, rows: np.ndarray) -> str:
-    """The name of the touch that ``rows`` are of."""
     return str(pack.column("touch_group" if "touch_group" in pack.table.column_names else "group")[rows[0]])
 
 
@@ -122,10 +108,7 @@ def places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
     """Name and values [N] of the column that orders the frames."""
     name = window.order or next((column for column in ORDER if column in pack.table.column_names), None)
     if name is None:
-        raise ValueError(
-            f"frames: {pack.spec.name!r} has none of the columns {', '.join(ORDER)}, which say the order of its frames:"
-            " name the one that does with --data.order"
-        )
+        raise ValueError(f"{pack.spec.name!r} has none of the columns {', '.join(ORDER)}: name its order, --data.order")
     cells = pack.column(name)
     try:
         place = cells.astype(float)

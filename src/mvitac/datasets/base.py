@@ -56,7 +56,7 @@ class DatasetConfig(Registered):
 
     def __post_init__(self) -> None:
         self.frame_window()
-        check_request(self.size, self.workers, store=self.store, quality=self.quality)
+        check_request(self.store, size=self.size, workers=self.workers, quality=self.quality)
 
     def frame_window(self) -> Window:
         """The frames that a row shows."""
@@ -101,8 +101,7 @@ class DatasetConfig(Registered):
         """Return the pack of single frames."""
         source = self.source()
         path = self.place(source)
-        unfinished = path.with_name(f"{path.name}.partial")  # beside a pack: its build was killed in the last clean-up
-        if path.exists() and not unfinished.exists():
+        if path.exists():
             return Pack(path)
         try:
             check_place(path)

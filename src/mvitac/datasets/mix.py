@@ -38,7 +38,7 @@ class MixConfig(DatasetConfig):
 
     def __post_init__(self) -> None:
         self.frame_window()
-        check_request(self.size or 256, self.workers, store=self.store, quality=self.quality)
+        check_request(self.store, size=self.size or 256, workers=self.workers, quality=self.quality)
         if not 0 <= self.temperature <= 10:
             raise ValueError(f"temperature {self.temperature}: give a number from 0 to 10")
         names = [name for name, _, _ in self.named_parts()]

@@ -4,8 +4,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, Literal
 
-import pyarrow as pa
-
 from mvitac.data.pack import Pack
 from mvitac.datasets.base import DatasetConfig
 
@@ -31,8 +29,8 @@ class PackConfig(DatasetConfig):
         if self.score_on == "val":
             if not len(pack.rows("val")):
                 raise ValueError(f"{self.path} has no split val to score on: leave out --data.score-on")
-            for name in pack.spec.split_columns:
-                column = [{"test": "hidden", "val": "test"}.get(split, split) for split in pack.column(name)]
-                pack.table = pack.table.set_column(pack.table.schema.get_field_index(name), name, pa.array(column))
+            others = {"test": "hidden", "val": "test"}
+            splits = {name: [others.get(s, s) for s in pack.column(name)] for name in pack.spec.split_columns}
+            pack = pack.with_splits(splits)
             pack.spec = replace(pack.spec, notes=(*pack.spec.notes, ON_VAL))
         return pack

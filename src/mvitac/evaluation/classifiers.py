@@ -97,38 +97,29 @@ def fit_linear(
     return Logistic(model, mean, std, num_classes or int(max(y.max(), y_val.max())) + 1), c
 
 
-def train_heads(
-    features: Tensor, labels: Tensor, num_classes: Sequence[int], seeds: Sequence[int]
-) -> list[list[Tensor]]:
+def train_heads(features: Tensor, labels: Tensor, num_classes: Sequence[int], seed: int) -> list[Tensor]:
     """Train the paper's probe (appendix A): linear, dropout .2, Adam 1e-4 (eps 1e-7), 60 epochs, batch size 256.
 
-    All tasks and seeds that share rows are trained at once. Adam updates each weight independently, so every head ends
-    as if it were trained alone. A model's seed sets its batch order and dropout, which all its tasks share.
-    ``features`` [S, N, D] are of S models, with a seed each, on the device to train on; ``labels`` [T, N] of T tasks.
-    Returns for each model a list of T weight matrices [num_classes, D + 1]; the last column is the bias.
+    All tasks that share rows are trained at once. Adam updates each weight independently, so every head ends as if it were
+    trained alone. ``seed`` sets the initial weights, the batch order and dropout. ``features`` [N, D] are on the device to
+    train on; ``labels`` [T, N] of T tasks. Returns T weight matrices [num_classes, D + 1]; the last column is the bias.
     """
-    models, num, width = features.shape
-    device = features.device
-    streams = [torch.Generator(device).manual_seed(seed) for seed in seeds]
-    start = torch.stack([torch.cat([_initial_weight(k, width, seed) for k in num_classes]) for seed in seeds])
-    weight = start.to(device).requires_grad_()
-    bias = torch.zeros(models, 1, sum(num_classes), device=device, requires_grad=True)
+    (num, width), device = features.shape, features.device
+    stream = torch.Generator(device).manual_seed(seed)
+    weight = torch.cat([_initial_weight(k, width, seed) for k in num_classes]).to(device).requires_grad_()
+    bias = torch.zeros(sum(num_classes), device=device, requires_grad=True)
     optimiser = torch.optim.Adam([weight, bias], lr=1e-4, eps=1e-7, fused=device.type in ("cpu", "cuda"))
-    labels, each = labels.to(device), torch.arange(models, device=device)[:, None]
+    labels = labels.to(device)
     for _ in range(EPOCHS):
-        order = torch.stack([torch.randperm(num, generator=g, device=device) for g in streams])
-        for batch in order.split(BATCH, dim=1):
-            x = features[each, batch]
-            keep = torch.stack([torch.rand(x.shape[1:], generator=g, device=device) for g in streams]) >= DROPOUT
-            logits = torch.baddbmm(bias, x * keep / (1 - DROPOUT), weight.mT).split(list(num_classes), dim=2)
-            loss = torch.zeros((), device=device)
-            for task, scores in enumerate(logits):  # mean over a model's pairs, summed over models and tasks
-                loss = loss + models * F.cross_entropy(scores.flatten(0, 1), labels[task][batch].flatten())
+        for batch in torch.randperm(num, generator=stream, device=device).split(BATCH):
+            x = features[batch]
+            keep = torch.rand(x.shape, generator=stream, device=device) >= DROPOUT
+            logits = F.linear(x * keep / (1 - DROPOUT), weight, bias).split(list(num_classes), dim=1)
+            losses = [F.cross_entropy(scores, labels[task][batch]) for task, scores in enumerate(logits)]
             optimiser.zero_grad()
-            loss.backward()
+            torch.stack(losses).sum().backward()
             optimiser.step()
-    joined = torch.cat([weight.detach(), bias.detach().mT], dim=2).cpu()
-    return [list(heads.split(list(num_classes))) for heads in joined]
+    return list(torch.cat([weight.detach(), bias.detach()[:, None]], dim=1).cpu().split(list(num_classes)))
 
 
 def _initial_weight(num_classes: int, width: int, seed: int) -> Tensor:
@@ -141,7 +132,7 @@ def fit_papers(x: np.ndarray, ys: list[np.ndarray], num_classes: list[int], seed
     """Fit the paper's probe for several tasks on the same rows; returns one classifier per task."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     labels = torch.from_numpy(np.stack(ys)).long()
-    heads = train_heads(torch.from_numpy(x).float()[None].to(device), labels, num_classes, [seed])[0]
+    heads = train_heads(torch.from_numpy(x).float().to(device), labels, num_classes, seed)
     return [partial(_linear_probabilities, head=head.numpy()) for head in heads]
 
 

@@ -12,9 +12,8 @@ import torch
 import torch.nn.functional as F
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import MODALITIES, AnyTask, DataSpec, Task, ValueTask
+from mvitac.data.spec import MODALITIES, AnyTask, DataSpec, Task
 from mvitac.evaluation.probe import (
-    ProbeSplit,
     names_in,
     probe_all,
     probe_features,
@@ -104,7 +103,14 @@ def label_controls(pack: Pack, tasks: Sequence[AnyTask]) -> Records:
     records = []
     for task in tasks:
         rows = split_rows(pack, task)
-        found = {"majority" if isinstance(task, Task) else "mean": _guess(pack, task, rows)}
+        if isinstance(task, Task):
+            name, answer = (
+                "majority",
+                np.eye(len(task.classes))[np.bincount(pack.labels(task.name)[rows.fitted]).argmax()],
+            )
+        else:
+            name, answer = "mean", np.nanmean(pack.values(task)[rows.fitted], axis=0)
+        found = {name: score_rows(pack, task, rows.test, np.tile(answer, (len(rows.test), 1)))}
         for name, columns in pack.spec.controls.items():
             x = np.stack([pack.column(column)[rows.all].astype(float) for column in columns], axis=1)
             if np.isfinite(x).all():  # else rows of a part of a mix that has no such control
@@ -112,15 +118,6 @@ def label_controls(pack: Pack, tasks: Sequence[AnyTask]) -> Records:
         for name, result in found.items():
             records += _named(name, None, [{"task": task.name, "modality": "none", "probe": "linear", **result}])
     return records
-
-
-def _guess(pack: Pack, task: AnyTask, rows: ProbeSplit) -> dict[str, Any]:
-    """Scores of one answer for all rows."""
-    if isinstance(task, ValueTask):
-        answer = np.nanmean(pack.values(task)[rows.fitted], axis=0)
-    else:
-        answer = np.eye(len(task.classes))[np.bincount(pack.labels(task.name)[rows.fitted]).argmax()]
-    return score_rows(pack, task, rows.test, np.tile(answer, (len(rows.test), 1)))
 
 
 def pixel_controls(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> Records:
@@ -183,5 +180,5 @@ def imagenet_trunk(encoder: EncoderConfig) -> EncoderConfig | None:
     """The trunk of ``encoder`` with ImageNet weights, or one whose weights come as a package; None if none are here."""
     for trunk in (encoder.trunk, *imagenet.PACKAGES):
         if imagenet.source(trunk):
-            return EncoderConfig(trunk=trunk, temporal="mean" if encoder.temporal == "attention" else encoder.temporal)
+            return EncoderConfig(trunk=trunk, temporal=encoder.temporal)
     return None

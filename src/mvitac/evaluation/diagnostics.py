@@ -149,18 +149,14 @@ def group_means(z: Float[Tensor, "N D"], groups: Int[Tensor, " N"]) -> Float[Ten
 
 
 def retrieval_ranks(
-    query: Float[Tensor, "N D"],
-    gallery: Float[Tensor, "M D"],
-    groups: Int[Tensor, " M"],
-    wanted: Int[Tensor, " N"] | None = None,
+    query: Float[Tensor, "N D"], gallery: Float[Tensor, "N D"], groups: Int[Tensor, " N"]
 ) -> Int[Tensor, " N"]:
-    """Rank (0 = first) of each query's own group, ``wanted`` (default: ``groups``, row by row).
+    """Rank (0 = first) of each query's own group, of which each is represented by its mean gallery embedding.
 
-    A group is represented by its mean gallery embedding. With one gallery entry per group, chance level R@k is exactly k /
-    number of groups.
+    With one gallery entry per group, chance level R@k is exactly k / number of groups.
     """
     similarity = F.normalize(query.float(), dim=1) @ group_means(gallery, groups).T
-    own = similarity.gather(1, (groups if wanted is None else wanted)[:, None])
+    own = similarity.gather(1, groups[:, None])
     # Ties count against the query, or constant embeddings would score.
     return (similarity >= own).sum(1) - 1
 

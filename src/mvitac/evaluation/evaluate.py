@@ -2,33 +2,33 @@
 
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from tabulate import tabulate
 
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
-from mvitac.data.row_hashes import number_hint
-from mvitac.data.spec import AnyTask, ValueTask
+from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
+from mvitac.evaluation import few_labels
 from mvitac.evaluation.controls import Records, controls_of, frozen_trunks
 from mvitac.evaluation.encoders import open_encoders, probe_encoders
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
-from mvitac.evaluation.probe import PROBES, probe_model, probes_of, seen_by, split_rows, with_classes
-from mvitac.evaluation.probe_config import ProbeConfig
+from mvitac.evaluation.probe import PROBES, Probe, probe_model, probes_of, seen_by, split_rows
 from mvitac.evaluation.retrieval import cross_modal, retrieved_rows
 from mvitac.evaluation.run_names import names_of
 from mvitac.evaluation.score_text import cell_text, columns_of, covered, score_name, sources_of, tested_on
 from mvitac.evaluation.scores import summarise
-from mvitac.evaluation.sensors import about_new, describe_statistics, sensor_records
+from mvitac.evaluation.sensors import Standardise, about_new, describe_statistics
 from mvitac.model import Model
 from mvitac.model_files import Which, load, weights_file
 from mvitac.nn.encoders import build_trunk
 from mvitac.registry import from_json, to_json, unknown
-from mvitac.run import Run, load_run
+from mvitac.run import load_run
 from mvitac.shipped import named
 from mvitac.system.files import check_place, digest_file, read_json, write_json
 from mvitac.system.progress import work
@@ -37,6 +37,42 @@ from mvitac.system.threads import in_threads
 Probed = tuple[Path, Model, str, list[Source] | None]  # a run: folder, model, name, and what it learned from
 END_TO_END = ", end to end"
 """Suffix of a source's name for the scores of its own heads, trained along with its encoders."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProbeConfig:
+    """What to probe, and whether to score controls."""
+
+    probes: tuple[Probe, ...] = ("linear",)
+    """linear: logistic regression, or ridge for values, C or alpha chosen on held-out groups of train. paper: the paper's
+    Adam probe. knn: 20 nearest."""
+    tasks: tuple[str, ...] = ()
+    """Tasks to probe. Default: all."""
+    modalities: tuple[Literal["touch", "vision", "both"], ...] = ()
+    """Modalities to probe. Default: all of the data."""
+    controls: bool = True
+    """Score the controls, too: a frozen ImageNet trunk (where weights are installed or cached), the untrained trunk, pixels,
+    border, majority class, and the dataset's own. --no-controls leaves them out."""
+    fractions: tuple[float, ...] = ()
+    """Also fit the linear probe on these percentages of the labels, such as 1 10."""
+    standardise: tuple[Standardise, ...] = ()
+    """Statistics of each touch sensor (column sensor), from unlabelled images. features: standardise its features by
+    their own mean and standard deviation. colours: show images of a sensor that --learn-on lacks in the colours of those
+    that it has, and take the mean features."""
+
+    def __post_init__(self) -> None:
+        given = {"probe": self.probes, "task": self.tasks, "modality": self.modalities, "standardise": self.standardise}
+        for name, values in given.items():
+            for value in values:
+                if values.count(value) > 1:
+                    raise ValueError(f"{name} {value!r} is given twice: give it once")
+        if not all(0 < percent <= 100 for percent in self.fractions):
+            raise ValueError(f"fractions {self.fractions}: give percentages, above 0, at most 100")
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """``probes``, and the linear probes on ``fractions`` of the labels."""
+        return (*self.probes, *map(few_labels.name, self.fractions))
 
 
 class Scores(dict[str, Any]):
@@ -100,8 +136,13 @@ def probe_runs(
         ValueError: If a path is no run, a run is given twice, the runs and the data do not fit together, or a run was
             trained on rows or groups that other data than its own would score.
     """
-    if paths or not encoders:
-        _check_paths(paths)
+    if not (paths or encoders):
+        raise ValueError("give at least one run's folder")
+    for path in paths:
+        if path.is_file():
+            raise ValueError(f"{path} is a file: give the run's folder, where the scores are also written")
+        if [p.resolve() for p in paths].count(path.resolve()) > 1:
+            raise ValueError(f"run {path} is given twice: it would count as two seeds, give it once")
     others = open_encoders(encoders, pack)
     models = [load(path, weights) for path in paths]
     names = [name + ", best" * (weights == "best") for name in names_of(paths, models)]
@@ -110,10 +151,14 @@ def probe_runs(
     for path, model in zip(paths, models, strict=True):
         check_place(path / "probe.json")
         check_channels(path, model, pack, pack.spec.modalities)
-    _check_tasks(pack, tasks, modalities)
+    for task in tasks:  # has rows to fit and to score
+        for modality in seen_by(pack, task, modalities):
+            split_rows(pack, task, modality)
     # The initial weights that an artifact names may be any file or download.
     runs = [m.run.fresh() if m.foreign else m.run for m in models]
-    _check_weights(runs, pack, session)
+    for _, run in frozen_trunks(runs) if session.controls else ():
+        for config in {run.encoder.vision, run.encoder.touch}:
+            build_trunk(config, 3)  # missing weights are found before any probe is fitted
     sources = check_unseen(paths, pack, tasks, allow_leak=allow_leak)
     each = [*zip(paths, models, names, sources, strict=True)]
     records, retrieval = _probe_models(each, pack, tasks, modalities, session)
@@ -122,43 +167,20 @@ def probe_runs(
         specs = [m.spec for m in models]
         found = controls_of(runs, pack, tasks, modalities, session.kinds, specs, session.standardise)
         records, retrieval = records + found[0], retrieval + found[1]
-    result = {**_describe_data(pack, tasks), "asked": to_json(session), "models": _digests(paths, weights)}
-    result |= {"encoders": [m.describe() for m, _ in others], "leaks": leaks_of([*records, *retrieval])}
-    result |= {"records": records, "retrieval": retrieval, "summary": summarise(records, session.probes[0])}
-    result |= _about_sensors(each, pack, session)
+    result = {
+        **{"data": pack.spec.name, "pack": pack.digest, "group_by": pack.spec.group_by, "notes": list(pack.spec.notes)},
+        "classes": {task.name: list(task.classes) for task in tasks if isinstance(task, Task)},
+        "targets": {task.name: to_json(task.targets) for task in tasks if isinstance(task, ValueTask)},
+        **{"asked": to_json(session), "models": _digests(paths, weights)},
+        **{"encoders": [m.describe() for m, _ in others], "leaks": leaks_of([*records, *retrieval])},
+        **{"records": records, "retrieval": retrieval, "summary": summarise(records, session.probes[0])},
+    }
+    new = dict.fromkeys(about_new(model, pack, session.standardise) for model in models)
+    if said := [*filter(None, new), *describe_statistics(pack, session.standardise)]:
+        result["statistics"] = said
     for path in paths:
         write_json(path / ("probe.best.json" if weights == "best" else "probe.json"), result, sealed=True)
     return Scores(result)
-
-
-def _about_sensors(each: Sequence[Probed], pack: Pack, session: ProbeConfig) -> dict[str, Any]:
-    """Which touch sensors are new, which statistics were used, and, if asked for, what features tell of the sensor."""
-    new = dict.fromkeys(about_new(model, pack, session.standardise) for _, model, _, _ in each)
-    lines = [*filter(None, new), *(describe_statistics(pack, session.standardise) if session.standardise else ())]
-    found: dict[str, Any] = {"statistics": lines} if lines else {}
-    if session.sensors:
-        scored = ((name, model, record) for _, model, name, _ in each for record in sensor_records(model, pack))
-        found["sensors"] = [{"source": name, "seed": model.run.seed, **record} for name, model, record in scored]
-    return found
-
-
-def _check_tasks(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> None:
-    """Raise ValueError if a task has no rows to fit or to score."""
-    for task in tasks:
-        for modality in seen_by(pack, task, modalities):
-            split_rows(pack, task, modality)
-
-
-def _describe_data(pack: Pack, tasks: Sequence[AnyTask]) -> dict[str, Any]:
-    """What a result says of its data."""
-    return {
-        "data": pack.spec.name,
-        "pack": pack.digest,
-        "group_by": pack.spec.group_by,
-        "notes": list(pack.spec.notes),
-        "classes": {task.name: list(task.classes) for task in with_classes(tasks)},
-        "targets": {task.name: to_json(task.targets) for task in tasks if isinstance(task, ValueTask)},
-    }
 
 
 def as_trained(model: Model, pack: Pack) -> Pack:
@@ -226,27 +248,16 @@ def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:
 
 
 def _digests(paths: Sequence[Path], weights: Which = "last") -> list[str]:
-    """Digests of the weights of finished runs, sorted."""
     return sorted(digest_file(weights_file(path, weights)) for path in paths)
-
-
-def _check_paths(paths: Sequence[Path]) -> None:
-    if not paths:
-        raise ValueError("give at least one run's folder")
-    for path in paths:
-        if path.is_file():
-            raise ValueError(f"{path} is a file: give the run's folder, where the scores are also written")
-        if [p.resolve() for p in paths].count(path.resolve()) > 1:
-            raise ValueError(f"run {path} is given twice: it would count as two seeds, give it once")
 
 
 def check_channels(path: Path, model: Model, pack: Pack, modalities: Sequence[str]) -> None:
     """Raise ValueError unless the ``model`` at ``path`` was trained on images like those of ``pack``."""
     for modality in modalities:
         if model.spec.channels(modality) != pack.spec.channels(modality):
+            learned, given = (spec.channels(modality) for spec in (model.spec, pack.spec))
             raise ValueError(
-                f"{path} cannot embed this data's {modality} ({pack.spec.channels(modality)} channels):"
-                f" it was trained on {model.spec.name!r}, with {model.spec.channels(modality)}"
+                f"{path} cannot embed this data's {modality} ({given} channels): it learned from {learned}"
             )
 
 
@@ -266,19 +277,9 @@ def check_unseen(
         refused = [] if allow_leak else (learned or [])[digest == pack.digest :]
         for task in tasks if refused else ():
             if (leak := scored.leak(refused, split_rows(pack, task).test)) not in ("", UNKNOWN):
-                hint = next(filter(None, (number_hint(source.name, pack) for source in refused)), "")
-                raise ValueError(
-                    f"{path} has seen what {pack.path} would score, task {task.name!r}: {leak}{hint}; give a pack whose test"
-                    " groups it was not trained on, or --allow-leak to score it with LEAK beside every score"
-                )
+                seen = f"{path} has seen what {pack.path} would score, task {task.name!r}: {leak}"
+                raise ValueError(f"{seen}; give a pack of other test groups, or --allow-leak to score it with LEAK")
     return sources
-
-
-def _check_weights(runs: Sequence[Run], pack: Pack, session: ProbeConfig) -> None:
-    """Load the weights of the controls once, so that missing ones are found before any probe is fitted."""
-    for _, run in frozen_trunks(runs) if session.controls else ():
-        for config in {run.encoder.vision, run.encoder.touch}:
-            build_trunk(config, 3)
 
 
 def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[AnyTask], list[str]]:
@@ -286,8 +287,7 @@ def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[AnyTask], list[str]]:
     known = {task.name: task for task in pack.spec.all_tasks}
     if not known:
         raise ValueError(
-            f"dataset {pack.spec.name!r} has no labels and no values: name columns with --labels or --values of `mvitac"
-            " data pack`, or with --data.labels or --data.values"
+            f"dataset {pack.spec.name!r} has no labels and no values: name columns with --data.labels or --data.values"
         )
     for name in session.tasks:
         if name not in known:

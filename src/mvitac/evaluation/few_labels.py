@@ -26,7 +26,13 @@ def few(
     There is at least one row of each class; of values, one of each target, and of a single target two different values.
     """
     share = percent / 100
-    rng, strata = np.random.default_rng([seed, round(1000 * share)]), _strata(pack, task, train)
+    rng = np.random.default_rng([seed, round(1000 * share)])
+    if isinstance(task, Task):
+        strata = pack.labels(task.name)
+    else:  # which values a row has, and whether they are low
+        values = pack.values(task)
+        low = (values < np.nanmedian(values[train], axis=0)).any(axis=1)
+        strata = np.unique(np.column_stack([np.isnan(values), low]), axis=0, return_inverse=True)[1]
 
     def some(rows: np.ndarray) -> np.ndarray:
         order = rng.permutation(len(rows))
@@ -36,12 +42,3 @@ def few(
         return np.sort(order[np.concatenate([first, rest])[:wanted]])
 
     return some(train), some(val)
-
-
-def _strata(pack: Pack, task: AnyTask, train: np.ndarray) -> np.ndarray:
-    """The class of each row of the pack; of values, which of them it has and whether they are low."""
-    if isinstance(task, Task):
-        return pack.labels(task.name)
-    values = pack.values(task)
-    low = (values < np.nanmedian(values[train], axis=0)).any(axis=1)
-    return np.unique(np.column_stack([np.isnan(values), low]), axis=0, return_inverse=True)[1]

@@ -94,7 +94,6 @@ def num_groups_of(record: dict[str, Any]) -> int:
 
 
 def _by_seed(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """``records`` ordered by seed, because equal seeds are paired."""
     return sorted(records, key=lambda record: -1 if record.get("seed") is None else record["seed"])
 
 

@@ -96,10 +96,8 @@ def _check_measured(values: np.ndarray, task: ValueTask, rows: dict[str, np.ndar
     for t, target in enumerate(task.targets):
         for split, mine in rows.items():
             if len(np.unique(values[mine, t][np.isfinite(values[mine, t])])) < 2:
-                raise ValueError(
-                    f"task {task.name!r}: {target.name} has fewer than two different values in split {split}: nothing to"
-                    " probe. Leave the target out, or split the groups otherwise"
-                )
+                why = f"{target.name} has fewer than two different values in split {split}"
+                raise ValueError(f"task {task.name!r}: {why}: nothing to probe, leave it out or split otherwise")
 
 
 def names_in(modality: str, pack: Pack) -> tuple[str, ...]:
@@ -192,15 +190,10 @@ def probe_model(
     by_modality = {m: touch_features(model, pack, m, rows, standardise) for m, rows in own.items()}
 
     def source(modality: str, rows: np.ndarray) -> np.ndarray:
-        return joined([by_modality[m][np.searchsorted(own[m], rows)] for m in names_in(modality, pack)])
+        return np.concatenate([by_modality[m][np.searchsorted(own[m], rows)] for m in names_in(modality, pack)], axis=1)
 
     records = probe_all(source, pack, tasks, modalities, probes, model.seed)
     return records + own_heads(model, pack, tasks, modalities)
-
-
-def joined(parts: list[np.ndarray]) -> np.ndarray:
-    """Features [N, D] of several modalities side by side."""
-    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
 
 def own_heads(
@@ -230,11 +223,6 @@ def _outputs(task: AnyTask) -> tuple[Any, ...]:
     return task.classes if isinstance(task, Task) else task.targets
 
 
-def with_classes(tasks: Sequence[AnyTask]) -> list[Task]:
-    """The tasks that ask for a class."""
-    return [task for task in tasks if isinstance(task, Task)]
-
-
 def score_rows(pack: Pack, task: AnyTask, rows: np.ndarray, predicted: np.ndarray) -> dict[str, Any]:
     """Score class probabilities [len(rows), K], or values [len(rows), T], ``predicted`` for pack ``rows``."""
     groups = group_numbers(pack, rows)
@@ -260,7 +248,8 @@ def probe_all(
 
     Each fitted probe advances the ``progress.work`` that counts "probes".
     """
-    papers = _papers(source, pack, with_classes(tasks), modalities, seed) if "paper" in probes else {}
+    classed = [task for task in tasks if isinstance(task, Task)]
+    papers = _papers(source, pack, classed, modalities, seed) if "paper" in probes else {}
     records = []
     for task in tasks:
         for modality in seen_by(pack, task, modalities):

@@ -23,10 +23,8 @@ def names_of(paths: Sequence[Path], models: Sequence[Model]) -> list[str]:
     for name, path, model in zip(names, paths, models, strict=True):
         seeds = alike.setdefault(name, {}).setdefault(_settings(path, model), {})
         if model.run.seed in seeds:
-            raise ValueError(
-                f"{seeds[model.run.seed]} and {path} are the same run (equal settings, seed {model.run.seed}):"
-                " they would count as two seeds, give one of them"
-            )
+            same = f"{seeds[model.run.seed]} and {path} are the same run (equal settings, seed {model.run.seed})"
+            raise ValueError(f"{same}: they would count as two seeds, give one of them")
         seeds[model.run.seed] = path
     where: dict[Path, str] = {}
     for kinds in alike.values():

@@ -66,7 +66,6 @@ def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
 
 
 def _pool_classes(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The scores of all groups together, of one task with classes."""
     sizes, correct = ([n for part in parts for n in part[key]] for key in ("group_sizes", "group_correct"))
     means = {}
     for key in ("balanced_accuracy", "macro_f1", "auroc"):

@@ -1,4 +1,4 @@
-"""Touch sensors: images or features of a new one in the terms of known ones, and how much features tell of the sensor.
+"""Touch sensors: images or features of a new one in the terms of known ones.
 
 All statistics come from images without labels. Shapes: features [N, D].
 """
@@ -6,24 +6,20 @@ All statistics come from images without labels. Shapes: features [N, D].
 import copy
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-import torch
 
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Pack
 from mvitac.data.spec import listed
-from mvitac.evaluation import diagnostics
-from mvitac.evaluation.classifiers import fit_linear
 from mvitac.evaluation.features import features, sample
 from mvitac.model import Model
 from mvitac.transforms.gel_colours import MIN_IMAGES, NUM_IMAGES, GelColours, Looks, learn_colours, recolour
 
 Standardise = Literal["colours", "features"]
 NUM_STATISTICS = 256  # images of a sensor that statistics are taken from, at most
-MIN_GALLERY = 11  # least number of presses for retrieval
 COLOURS = "--standardise colours"  # the option of probe that errors name
 MAX_LOOKS = 4  # known sensors in whose colours a new one is shown, at most
 
@@ -76,7 +72,7 @@ def unlabelled_rows(pack: Pack, sensor: int, num: int = NUM_STATISTICS) -> np.nd
 def describe_statistics(pack: Pack, standardise: tuple[Standardise, ...]) -> list[str]:
     """Sentences that say how many images of each sensor ``standardise`` used."""
     found = []
-    for number, name in enumerate(pack.sensor_names):
+    for number, name in enumerate(pack.sensor_names if standardise else ()):
         rows = unlabelled_rows(pack, number, NUM_IMAGES if "colours" in standardise else NUM_STATISTICS)
         tested = ", test images among them" if (pack.column("split")[rows] == "test").any() else ""
         found.append(f"uses {len(rows)} unlabelled images of sensor {name}{tested}")
@@ -191,51 +187,3 @@ def _colours_of(pack: Pack, number: int, option: str) -> GelColours:
         return learn_colours(pack.images["touch"][unlabelled_rows(pack, number, NUM_IMAGES)])
     except ValueError as error:
         raise ValueError(f"sensor {pack.sensor_names[number]!r}: {error}; or leave {option} out") from None
-
-
-def sensor_records(model: Model, pack: Pack) -> list[dict[str, Any]]:
-    """How much touch features tell of the sensor: "name", "score", "chance" and "num" of up to two measures.
-
-    "which sensor": accuracy of a logistic regression on test rows, beside the share of the most common sensor. "same spot,
-    other sensor": ``cross_sensor``.
-    """
-    return [record for record in (_which_sensor(model, pack), cross_sensor(model, pack)) if record]
-
-
-def _record(name: str, hits: np.ndarray, chance: float) -> dict[str, Any]:
-    return {"name": name, "score": float(np.mean(hits)), "chance": chance, "num": len(hits)}
-
-
-def _which_sensor(model: Model, pack: Pack) -> dict[str, Any] | None:
-    """None if train has one sensor only, or test one that train lacks."""
-    train, val, test = (pack.rows(split, having=("touch",)) for split in ("train", "val", "test"))
-    val = val if len(val) else train
-    right = pack.sensors[test]
-    if len(np.unique(pack.sensors[train])) < 2 or not len(test) or not np.isin(right, pack.sensors[train]).all():
-        return None
-    z = [features(model, pack, "touch", rows) for rows in (train, val, test)]
-    predict, _ = fit_linear(z[0], pack.sensors[train], z[1], pack.sensors[val])
-    common = np.bincount(pack.sensors[train]).argmax()
-    return _record("which sensor", predict(z[2]).argmax(1) == right, float((right == common).mean()))
-
-
-def cross_sensor(model: Model, pack: Pack) -> dict[str, Any] | None:
-    """R@5 of each test touch: its press among the images of all test presses through other sensors.
-
-    Each query sees one image of every press that another sensor pressed, so chance is 5 / their number. None for packs
-    without presses through several sensors.
-    """
-    if "press" not in pack.table.column_names:
-        return None
-    rows = pack.rows("test", having=("touch",))
-    presses, sensors, hits, chances = pack.presses[rows], pack.sensors[rows], [], []
-    z = torch.from_numpy(features(model, pack, "touch", rows))
-    for number in np.unique(sensors):
-        others = np.flatnonzero(sensors != number)
-        others = others[np.unique(presses[others], return_index=True)[1]]  # one image of each press
-        queries = np.flatnonzero((sensors == number) & np.isin(presses, presses[others]))
-        if len(queries) and len(others) >= MIN_GALLERY:
-            place = torch.from_numpy(np.searchsorted(presses[others], presses[queries]))
-            hits.append(diagnostics.retrieval_ranks(z[queries], z[others], torch.arange(len(others)), place) < 5)
-            chances += [5 / len(others)] * len(queries)
-    return _record("same spot, other sensor", np.concatenate(hits), float(np.mean(chances))) if hits else None

@@ -97,7 +97,6 @@ def adapt(
 
 
 def _run_of(model: Model, ancestor: Path, data: DatasetConfig, pack: Pack, asked: Adaptation) -> Run:
-    """The run of ``model`` on the new data, from its weights."""
     old = model.run.fresh()
     lr = old.optim.lr / 10 if asked.lr is None else asked.lr
     size = asked.batch_size or max(2, min(old.batch_size, len(old.method.training_rows(pack))))

@@ -82,18 +82,13 @@ def _check_row(plan: Plan, row: Row, pack: Pack) -> tuple[Pack, str]:
     if missing := sorted(key for key in row.set if key.startswith("data.") and not hasattr(plan.data, key[5:])):
         raise ValueError(f"dataset {plan.data.name!r} has no {', '.join(missing)}")
     run = plan.run(row, plan.data, 0, pack.phased)
-    own = pack if run.data == plan.data else _same_samples(run.data.open(), pack)
-    run.check(own.spec, len(run.method.training_rows(own)), own.size)
-    run.method.on_tiny_trunk(own.spec, run.encoder)
-    return own, run.without_idle(own.spec).digest()
-
-
-def _same_samples(own: Pack, pack: Pack) -> Pack:
-    """Return ``own`` if it has the samples, splits and labels of ``pack``."""
+    own = pack if run.data == plan.data else run.data.open()
     for name in ("id", "group", "split", *(f"label_{task.name}" for task in pack.spec.tasks)):
         if name not in own.table.column_names or not np.array_equal(own.column(name), pack.column(name)):
             raise ValueError(f"its data {own.path} has another column {name} than {pack.path}: give the same samples")
-    return own
+    run.check(own.spec, len(run.method.training_rows(own)), own.size)
+    run.method.on_tiny_trunk(own.spec, run.encoder)
+    return own, run.without_idle(own.spec).digest()
 
 
 def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
@@ -106,7 +101,7 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
     scored = [_scores(job) for job in finished]
     controls, found = _controls(work, out, session)
     others, described, names = _encoders(work, out, session)
-    runs = [load_run(job.out) for job in finished]
+    runs, labels = [load_run(job.out) for job in finished], dict.fromkeys(job.label for job in finished)
     return {
         "plan": to_json(work.plan),
         "data": work.pack.spec.name,
@@ -121,7 +116,7 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
         "left_out": work.left_out,
         "failed": failed,
         "unfinished": [job.name for job in work.jobs if not job.done],
-        "cost": [cost(label, [j for j in finished if j.label == label], work.pack) for label in _labels(finished)],
+        "cost": [cost(label, [j for j in finished if j.label == label], work.pack) for label in labels],
         "device": describe(pick_device(work.jobs[0].run.device)),
         "run_commits": list(dict.fromkeys(record.get("commit") for _, record in runs)),
         "run_devices": list(dict.fromkeys(record.get("device", "unknown device") for _, record in runs)),
@@ -153,10 +148,6 @@ def _encoders(work: Work, out: Path, session: ProbeConfig) -> tuple[Records, lis
     if bound:
         write_json(path, {"key": key, "records": records}, sealed=True)
     return records, described, names
-
-
-def _labels(jobs: Sequence[Job]) -> list[str]:
-    return list(dict.fromkeys(job.label for job in jobs))
 
 
 def _controls(work: Work, out: Path, session: ProbeConfig) -> tuple[Records, Records]:
@@ -194,12 +185,11 @@ def leaks(pack: Pack, tasks: Sequence[AnyTask]) -> str:
 
 
 def cost(label: str, jobs: Sequence[Job], pack: Pack) -> dict[str, Any]:
-    """Steps, pairs, images, median seconds and (if measured) peak GPU memory of one run of a row."""
+    """Steps, pairs, images and median seconds of one run of a row."""
     run = jobs[0].run
     rows = len(run.method.training_rows(pack))
     method = run.method.build(pack.spec, run.encoder.changed(weights=SCRATCH))
     steps = run.num_steps(rows)
-    peaks = [read_json(p, "peak memory")["peak_bytes"] for job in jobs if (p := job.out / "memory.json").exists()]
     return {
         "row": label,
         "seeds": len(jobs),
@@ -209,7 +199,6 @@ def cost(label: str, jobs: Sequence[Job], pack: Pack) -> dict[str, Any]:
         "images": steps * run.batch_size * method.views * len(method.encoders()),
         "trained_parameters": sum(p.numel() for p in method.parameters() if p.requires_grad),
         "seconds": statistics.median(job.seconds() for job in jobs),
-        "peak_gpu_bytes": int(np.max(peaks)) if peaks else None,
     }
 
 
@@ -222,17 +211,18 @@ def pairs_of(run: Run, views: int, pack: Pack) -> str:
 
 def outline(work: Work) -> list[str]:
     """Lines that describe the plan: rows, runs, steps, pairs, what is finished and what is left out."""
-    rows = {label: next(job for job in work.jobs if job.label == label) for label in _labels(work.jobs)}
+    rows: dict[str, list[Job]] = {}
+    for job in work.jobs:
+        rows.setdefault(job.label, []).append(job)
     num = len({job.fold for job in work.jobs})
     folds = f" x {num} folds" if num > 1 else ""
     lines = [f"plan {work.plan.name}: {len(rows)} rows x {work.plan.seeds} seeds{folds} = {len(work.jobs)} runs"]
-    for label, job in rows.items():
-        num = len(job.run.method.training_rows(work.pack))
-        steps = job.run.num_steps(num)
-        mine = [j for j in work.jobs if j.label == label]
+    for label, mine in rows.items():
+        run = mine[0].run
+        num = len(run.method.training_rows(work.pack))
         lines.append(
-            f"  {label}: {job.run.method.name}, {steps} steps x {job.run.batch_size} pairs of {num} rows,"
-            f" {sum(j.done for j in mine)} of {len(mine)} finished"
+            f"  {label}: {run.method.name}, {run.num_steps(num)} steps x {run.batch_size} pairs of {num} rows,"
+            f" {sum(job.done for job in mine)} of {len(mine)} finished"
         )
     lines += [f"  left out: {label} ({reason})" for label, reason in work.left_out.items()]
     todo = [job for job in work.jobs if not job.done]

@@ -51,10 +51,8 @@ def _check_tested_once(fold: str, pack: Pack, tasks: Sequence[AnyTask], tested: 
         own = "" if column == "split" else f" (column {column})"
         for group in np.unique(groups[pack.rows("test", by=column)]).tolist():
             if (column, group) in tested:
-                raise ValueError(
-                    f"folds {tested[column, group]!r} and {fold!r} both test {pack.spec.group_by} {group!r}{own}: each"
-                    " group must be tested once"
-                )
+                both = f"folds {tested[column, group]!r} and {fold!r} both test {pack.spec.group_by} {group!r}{own}"
+                raise ValueError(f"{both}: each group must be tested once")
             tested[column, group] = fold
 
 

@@ -100,12 +100,17 @@ def finetune(
     model, pack = load(ancestor), data.open(quiet=quiet)
     names = (*asked.labels, *asked.values) or tuple(task.name for task in pack.spec.tasks or pack.spec.values)
     tasks = tuple(chosen(pack, ProbeConfig(tasks=names))[0])
-    method = _method(asked, tasks, ancestor, model, pack)
-    modality = "both" if len(method.modalities) == 2 else method.modalities[0]
+    modalities: Any = asked.modalities or tuple(m for m in pack.spec.modalities if m in model.encoders)
+    check_channels(ancestor, model, pack, modalities or tuple(model.encoders))
+    method = SupervisedConfig(tasks=tuple(task.name for task in tasks), modalities=modalities, train=asked.train)
+    modality = "both" if len(modalities) == 2 else modalities[0]
     job = _Job(asked, model, pack, _run_of(model, ancestor, data, pack, method), tasks, modality, out, say, quiet)
     for task in tasks:
         job.test(task)
-        _check_classes(job, task)
+        if isinstance(task, Task):
+            seen = {task.classes[label] for label in pack.labels(task.name)[job.answered(task)]}
+            if len(seen) < 2:
+                raise ValueError(f"task {task.name!r} has labels of one class only in train ({', '.join(seen)})")
     if 100 in asked.fractions and len(asked.lr) + len(asked.steps) > 2 and (why := job.too_few(100)):
         raise ValueError(f"{why}: give one --lr and one --steps")
     sources = check_unseen([ancestor], pack, tasks, allow_leak=asked.allow_leak)[0]
@@ -121,15 +126,6 @@ def finetune(
     return result
 
 
-def _method(
-    asked: Finetuning, tasks: tuple[AnyTask, ...], ancestor: Path, model: Model, pack: Pack
-) -> SupervisedConfig:
-    modalities: Any = asked.modalities or tuple(m for m in pack.spec.modalities if m in model.encoders)
-    check_channels(ancestor, model, pack, modalities or tuple(model.encoders))
-    names = tuple(task.name for task in tasks)
-    return SupervisedConfig(tasks=names, modalities=modalities, train=asked.train)
-
-
 def _run_of(model: Model, ancestor: Path, data: DatasetConfig, pack: Pack, method: SupervisedConfig) -> Run:
     """Fine-tuning with all labels: light views at the size at which the frozen features are probed."""
     sides = {m: min(model.sides(m)[0], pack.size) for m in model.encoders}
@@ -143,8 +139,6 @@ def _run_of(model: Model, ancestor: Path, data: DatasetConfig, pack: Pack, metho
 
 @dataclass(frozen=True)
 class _Job:
-    """Fine-tuning of one model on one pack."""
-
     asked: Finetuning
     model: Model
     pack: Pack
@@ -188,17 +182,10 @@ class _Job:
         known = {"source": kind, "seed": seed, "fraction": percent}
         return [{**known, **record, "leak": scored.leak(learned, rows[record["task"]])} for record in found]
 
-    def answered(self, task: AnyTask, rows: np.ndarray) -> np.ndarray:
+    def answered(self, task: AnyTask, method: SupervisedConfig | None = None) -> np.ndarray:
+        """The rows of ``task`` that ``method`` (default: that of all labels) learns from."""
+        rows = (method or self.run.method).training_rows(self.pack)
         return rows[self.pack.answered(task, "train", "val")[rows]]
-
-
-def _check_classes(job: _Job, task: AnyTask) -> None:
-    if isinstance(task, Task):
-        labels = job.pack.labels(task.name)[job.answered(task, job.run.method.training_rows(job.pack))]
-        if len(seen := {task.classes[label] for label in labels}) < 2:
-            raise ValueError(
-                f"task {task.name!r} has labels of one class only in train ({', '.join(seen)}): nothing to learn"
-            )
 
 
 def _fraction(job: _Job, percent: float, sources: list[Source] | None) -> tuple[Records, dict[str, Any]]:
@@ -259,7 +246,7 @@ def _held_out_error(job: _Job, percent: float, kind: str, settings: dict[str, An
 
 def _frozen(job: _Job, percent: float, seed: int, task: AnyTask) -> dict[str, Any]:
     """Test scores of a linear probe on the frozen encoders, fitted on the rows that this seed is fine-tuned on."""
-    rows = job.answered(task, job.method(percent, seed).training_rows(job.pack))
+    rows = job.answered(task, job.method(percent, seed))
     fitted = held = rows  # with too few groups, C or alpha is chosen on the rows that the probe is fitted on
     if not job.too_few(percent, seed):
         fitted = np.intersect1d(rows, job.method(percent, seed, hold_out=True).training_rows(job.pack))

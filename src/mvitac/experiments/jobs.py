@@ -21,7 +21,6 @@ from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.experiments.plan import Plan
 from mvitac.registry import to_json
 from mvitac.run import Run
-from mvitac.system.device import pick_device
 from mvitac.system.files import brief, read_json, write_json
 from mvitac.system.locks import Busy, hold_lock
 from mvitac.training.checkpoint import CHECKPOINT, PREVIOUS
@@ -81,28 +80,20 @@ class Work:
 def do(job: Job, pack: Pack | None = None, *, quiet: bool = True) -> str:
     """Train and score one run; returns a line about it. Safe to call again after a kill. Busy if another process has it."""
     with hold_lock(job.out, "another process runs it", wait=False):
-        return "finished before" if job.done else _do(job, pack, quiet)
-
-
-def _do(job: Job, pack: Pack | None, quiet: bool) -> str:
-    pack = pack or job.run.data.open(quiet=True)
-    gpu = pick_device(job.run.device)
-    measured = gpu.type == "cuda" and not (job.out / "model.safetensors").exists()
-    if measured:
-        torch.cuda.reset_peak_memory_stats(gpu)
-    try:
-        train(job.run, job.out, resume=True, quiet=quiet, pack=pack)
-    except Diverged as error:
-        write_json(job.out / "failed.json", {"error": str(error)}, sealed=True)
-        return f"diverged: {error}"
-    if measured:
-        write_json(job.out / "memory.json", {"peak_bytes": torch.cuda.max_memory_allocated(gpu)})
-    result = probe_runs([job.out], job.session, pack)
-    scores = {"asked": job.asked, "records": result["records"], "retrieval": result["retrieval"]}
-    write_json(job.out / "scores.json", scores, sealed=True)
-    for name in (CHECKPOINT, PREVIOUS):  # a scored run needs none, and one is four times as large as the weights
-        (job.out / name).unlink(missing_ok=True)
-    return f"{job.seconds():.0f} s of training"
+        if job.done:
+            return "finished before"
+        pack = pack or job.run.data.open(quiet=True)
+        try:
+            train(job.run, job.out, resume=True, quiet=quiet, pack=pack)
+        except Diverged as error:
+            write_json(job.out / "failed.json", {"error": str(error)}, sealed=True)
+            return f"diverged: {error}"
+        result = probe_runs([job.out], job.session, pack)
+        scores = {"asked": job.asked, "records": result["records"], "retrieval": result["retrieval"]}
+        write_json(job.out / "scores.json", scores, sealed=True)
+        for name in (CHECKPOINT, PREVIOUS):  # a scored run needs none, and one is four times as large as the weights
+            (job.out / name).unlink(missing_ok=True)
+        return f"{job.seconds():.0f} s of training"
 
 
 def do_all(work: Work, num_jobs: int = 1, *, quiet: bool = False) -> None:

@@ -1,7 +1,9 @@
-"""The description of a comparison: rows, tasks, probes, seeds."""
+"""The description of a comparison: rows, tasks, probes, seeds. Plans that ship with the package are in ``plans/``."""
 
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal
 
 from mvitac.data.spec import MODALITIES
@@ -9,10 +11,11 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.probe import Probe
 from mvitac.recipes import recipe, with_method
-from mvitac.registry import to_json, unknown
+from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run
-from mvitac.system.files import parse_json
+from mvitac.system.files import brief, parse_json
 
+PLANS = ("table1", "table2", "ablation", "recipes")
 Printed = dict[str, dict[str, float]]  # modality -> task -> top-1 accuracy in percent as printed in the paper
 ONE_ROW = "one row"  # where the pairs of a run are from if its positives are views of the same image, as in the paper
 
@@ -121,6 +124,23 @@ class Plan:
             return replace(changed(base, {**self.set, **row.set}), seed=seed)
         except ValueError as error:
             raise ValueError(f"row {row.label!r}: {error}") from None
+
+
+def find_plan(given: str) -> Plan:
+    """A plan by name, or from a .toml or .json file; ValueError if it does not exist or is not valid."""
+    path = Path(__file__).parent / "plans" / f"{given}.toml" if given in PLANS else Path(given)
+    if path.suffix not in (".toml", ".json"):
+        raise unknown("plan", given, [*PLANS, "a .toml file", "a .json file"])
+    try:
+        text = path.read_text()
+        value = tomllib.loads(text) if path.suffix == ".toml" else parse_json(text)
+    except FileNotFoundError:
+        raise ValueError(f"plan {given} does not exist: choose {', '.join(PLANS)}, or give a file that does") from None
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"plan {given} is not valid {path.suffix[1:].upper()}: {brief(error)}") from None
+    if not isinstance(value, dict):
+        raise ValueError(f"plan {given}: expected an object with name and rows")
+    return from_json(Plan, {"name": path.stem, **value}, "plan")
 
 
 def slug(label: str) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
 from tabulate import SEPARATING_LINE, tabulate
 
 from mvitac.evaluation.encoders import about_lines
@@ -16,9 +17,9 @@ from mvitac.evaluation.intervals import least_p, num_groups_of
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import covered, error_text, percent, pipes, with_interval
 from mvitac.evaluation.scores import by_cell
-from mvitac.experiments.plan import Plan
+from mvitac.experiments.plan import Plan, slug
 from mvitac.experiments.table import Line, as_printed, lines_of, plan_of, target_lines
-from mvitac.report.figures import comparison, to_png
+from mvitac.report.figures import bars, to_png
 from mvitac.report.tables import RETRIEVAL, probe_name, retrieval_rows
 from mvitac.system.files import write_atomic, write_json
 
@@ -27,16 +28,25 @@ VALUES = ("score", "target", "unit", "mae", "rmse")  # columns of the CSV if the
 
 
 def write_tables(result: dict[str, Any], out: Path) -> list[Path]:
-    """Write result.json, table.md, table.tex, table.csv and table.png into ``out``; returns their paths."""
+    """Write result.json, table.md, table.tex, table.csv and a figure of each task into ``out``; returns their paths."""
     write_json(out / "result.json", result)
     lines = lines_of(result)
     texts = {"md": markdown(result, lines), "tex": latex(result, lines), "csv": comma(result)}
-    files = {f"table.{kind}": text.encode() for kind, text in texts.items()} | {
-        "table.png": to_png(comparison(lines), dpi=110)
-    }
+    files = {f"table.{kind}": text.encode() for kind, text in texts.items()}
+    for task, score in _columns(lines).items():
+        files[f"table.{slug(task)}.png"] = to_png(figure(lines, task, score), dpi=110)
     for name, content in files.items():
         write_atomic(out / name, lambda file, content=content: file.write(content))
     return [out / name for name in (*files, "result.json")]
+
+
+def figure(lines: Sequence[Line], task: str, score: str) -> Figure:
+    """One column of the table as bars."""
+    groups: dict[str, dict[str, Any]] = {}
+    for line in (line for line in lines if task in line.cells):
+        groups.setdefault(line.modality, {})[line.source] = line.cells[task]
+    same = {source: cell["mean"] for source, cell in groups.pop("none", {}).items()}
+    return bars(task, groups, same, f"{score} %, mean and 95 % interval", width=7, length=48)
 
 
 def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
@@ -185,10 +195,9 @@ def _cost(result: dict[str, Any]) -> list[str]:
     heads = ["cost of one run", "from", "seeds", "steps", "pairs", "images seen", "trained weights", "seconds"]
     rows = []
     for c in result["cost"]:
-        peak = f"{c['peak_gpu_bytes'] / 2**20:.0f}" if c["peak_gpu_bytes"] else "not measured"
         numbers = [str(c[key]) for key in ("row", "pairs_of", "seeds", "steps", "pairs", "images")]
-        rows.append([*numbers, f"{c['trained_parameters'] / 1e6:.2f} M", f"{c['seconds']:.0f}", peak])
-    return [*pipes([*heads, "peak GPU MiB"], rows), *(f"- {line}" for line in about_lines(result["encoders"]))]
+        rows.append([*numbers, f"{c['trained_parameters'] / 1e6:.2f} M", f"{c['seconds']:.0f}"])
+    return [*pipes(heads, rows), *(f"- {line}" for line in about_lines(result["encoders"]))]
 
 
 def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:

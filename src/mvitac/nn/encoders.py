@@ -81,9 +81,9 @@ class EncoderConfig:
     stem: Fixed[Literal["repeat", "random"]] = "repeat"
     """Start of a pretrained trunk's first convolution for images that do not have three channels: timm repeats and rescales
     its filters, or random (the authors' code)."""
-    temporal: Literal["stack", "mean", "attention"] = "stack"
+    temporal: Literal["stack", "mean"] = "stack"
     """How several frames of a window are read. stack: as channels of one image. mean: the trunk sees each frame, and their
-    features are averaged. attention: their weighted mean, with weights learned from the features and the frame's age."""
+    features are averaged."""
     locked: bool = False
     """Keep the trunk as it starts; its heads and the other trunk are trained (LiT, arXiv:2111.07991)."""
     keep_norms: bool = False
@@ -149,7 +149,7 @@ def build_trunk(config: EncoderConfig, channels: int, frames: int = 1) -> nn.Mod
     """
     single = frames == 1 or config.temporal == "stack"
     trunk = use_products(_with_stem(config, channels if single else channels // frames))
-    trunk = trunk if single else PerFrame(trunk, frames, attention=config.temporal == "attention")
+    trunk = trunk if single else PerFrame(trunk, frames)
     trunk.locked, trunk.keep_norms = config.locked, config.keep_norms  # type: ignore[assignment]
     return trunk.requires_grad_(False) if config.locked else trunk
 
@@ -171,31 +171,16 @@ def keep_modes(network: nn.Module) -> None:
 
 
 class PerFrame(nn.Module):
-    """A trunk that sees the F frames of a window one by one: [B, F C, H, W] to the mean of their features [B, D].
+    """A trunk that sees the F frames of a window one by one: [B, F C, H, W] to the mean of their features [B, D]."""
 
-    With ``attention`` the mean is weighted by a softmax over frames of a learned score: a linear function of the frame's
-    features plus a bias for its age. It starts as the plain mean.
-    """
-
-    def __init__(self, trunk: nn.Module, frames: int, *, attention: bool) -> None:
+    def __init__(self, trunk: nn.Module, frames: int) -> None:
         super().__init__()
         self.trunk, self.frames = trunk, frames
         self.num_features = num_features(trunk)
-        self.score = nn.Linear(self.num_features, 1, bias=False) if attention else None
-        if self.score is not None:
-            nn.init.zeros_(self.score.weight)
-            self.age = nn.Parameter(torch.zeros(frames))
 
     def forward(self, images: Tensor) -> Tensor:
-        features = self.trunk(self._each(images)).unflatten(0, (-1, self.frames))
-        return features.mean(1) if self.score is None else (self._weights(features).unsqueeze(2) * features).sum(1)
-
-    def _each(self, images: Tensor) -> Tensor:
-        return images.unflatten(1, (self.frames, -1)).flatten(0, 1)
-
-    def _weights(self, features: Tensor) -> Tensor:
-        assert self.score is not None
-        return (self.score(features).squeeze(2) + self.age).softmax(dim=1)
+        each = images.unflatten(1, (self.frames, -1)).flatten(0, 1)
+        return self.trunk(each).unflatten(0, (-1, self.frames)).mean(1)
 
 
 def _with_stem(config: EncoderConfig, channels: int) -> nn.Module:

@@ -75,8 +75,6 @@ def load_trunk(trunk: nn.Module, state: dict[str, Tensor], file: Path | str = "i
     inner = {name.removeprefix("trunk."): value for name, value in state.items() if name.startswith("trunk.")}
     single = trunk.trunk if isinstance(trunk, PerFrame) else trunk
     load_weights(single, inner or state, file)
-    if isinstance(trunk, PerFrame) and inner and fits(trunk, state):
-        trunk.load_state_dict(state)  # the weights of the frames, too
 
 
 def fits(module: nn.Module, state: dict[str, Tensor]) -> bool:

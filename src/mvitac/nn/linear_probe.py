@@ -102,11 +102,8 @@ class LinearProbe(nn.Module):
         super().__init__()
         num = len(info.outputs)
         if weight.ndim != 2 or weight.shape[0] != num or tuple(bias.shape) != (num,):
-            raise ValueError(
-                f"probe {info.name}: weights of shape {tuple(weight.shape)} and bias of shape {tuple(bias.shape)}"
-                f" do not fit {num} {'classes' if isinstance(info, ProbeInfo) else 'targets'}: expected [{num}, D] and"
-                f" [{num}]"
-            )
+            shapes = f"weights {tuple(weight.shape)} and bias {tuple(bias.shape)}"
+            raise ValueError(f"probe {info.name}: {shapes} do not fit {num} outputs: expected [{num}, D] and [{num}]")
         if bounds is not None and bounds.shape != (2, weight.shape[1]):
             raise ValueError(
                 f"probe {info.name}: bounds of shape {tuple(bounds.shape)}: expected [2, {weight.shape[1]}]"

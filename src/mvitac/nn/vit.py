@@ -48,18 +48,14 @@ def check_vit(config: EncoderConfig, method: str, size: int) -> None:
     with torch.device("meta"):
         vit = _plain(build_trunk(EncoderConfig(trunk=config.trunk, weights=SCRATCH), 3), config.trunk, method)
     if size <= vit.patch_embed.patch_size[0]:
-        raise ValueError(
-            f"views of {size} px are a single patch of trunk {config.trunk}, and method {method!r} hides patches from"
-            f" others: give --augment.size {size * 2} or more"
-        )
+        one = f"views of {size} px are a single patch of trunk {config.trunk}, and {method!r} hides patches from others"
+        raise ValueError(f"{one}: give --augment.size {size * 2} or more")
 
 
 def _plain(trunk: nn.Module, name: str, method: str) -> VisionTransformer:
     if not (isinstance(trunk, VisionTransformer) and isinstance(trunk.patch_embed, PatchEmbed)):
-        raise ValueError(
-            f"method {method!r} needs a plain ViT, and trunk {name} is a {type(trunk).__name__}: give e.g."
-            " --encoder.trunk mvitac_vit --encoder.weights scratch"
-        )
+        given = f"method {method!r} needs a plain ViT, and trunk {name} is a {type(trunk).__name__}"
+        raise ValueError(f"{given}: give --encoder.trunk mvitac_vit --encoder.weights scratch")
     return trunk
 
 
@@ -70,16 +66,11 @@ def build_vits(config: Encoders, spec: DataSpec, method: str, senses: Senses) ->
     how windows are read does not fit the data.
     """
     if senses == "both" and len(spec.modalities) < 2:
-        raise ValueError(
-            f"senses both: dataset {spec.name!r} has {', '.join(spec.modalities)} only, give --method.senses own"
-        )
+        have = ", ".join(spec.modalities)
+        raise ValueError(f"senses both: dataset {spec.name!r} has {have} only, give --method.senses own")
     trunks = nn.ModuleDict()
     for modality in spec.modalities:
         own, windows = config[modality], spec.frames(modality) > 1
-        if windows and own.temporal == "attention":
-            raise ValueError(
-                f"method {method!r} does not train temporal attention: give --encoder.temporal mean or stack"
-            )
         if windows and own.temporal == "mean" and senses == "both":
             raise ValueError("senses both reads the frames of a window together: give --encoder.temporal stack")
         trunks[modality] = build_trunk(own, spec.channels(modality), spec.frames(modality))

@@ -1,41 +1,36 @@
-"""A contact sheet of a pack: a few pairs of each class or object, to check the data by eye.
+"""A contact sheet of a pack: a few pairs of each class or object, or the suspicious rows, to check the data by eye.
 
 Check that camera and touch belong together, labels are right, colours look natural, and nothing is blank or upside down.
 """
 
+import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from mvitac.data.checks.finding import Finding
+from mvitac.data.images import fit, side_by_side
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
 from mvitac.registry import unknown
-from mvitac.report.image_grid import Block, Tile, contents, draw, pair
 
-TASK = "label_"
+Tile = tuple[np.ndarray, str]  # a picture, uint8 [H, W, 3], and the text below it
+Block = tuple[str, Sequence[Tile]]  # pictures under one heading
 SIDE, NUM_SHOWN, NUM_SAMPLE = 96, 8, 24  # pixels; rows shown of a finding; rows shown if nothing is suspicious
-
-
-@dataclass(frozen=True)
-class Strip:
-    """One class or object: name, number of rows and groups, and the rows to show."""
-
-    name: str
-    num_rows: int
-    num_groups: int
-    rows: np.ndarray
+GAP = 8  # pixels between pictures
+MISSING, CROSS = 225, 150  # gray levels of the tile that stands for a missing image
 
 
 def strips(
     pack: Pack, by: str = "", *, split: str = "", num: int = 6, limit: int = 40, seed: int = 0
-) -> tuple[list[Strip], int]:
+) -> tuple[list[tuple[str, np.ndarray]], int]:
     """Choose random rows of each value of the task or column ``by`` (default: the first task, else the group).
 
     Of its ``num`` rows, those of different groups (within one group: touches) come first. Returns at most ``limit``
-    strips, and their number without it.
+    strips, each a heading such as ``wood: 48 rows, 12 objects`` and its rows, and their number without it.
     """
     if split and split not in SPLITS:
         raise unknown("split", split, SPLITS)
@@ -45,7 +40,7 @@ def strips(
     by = by or (names[0] if names else "group")
     if by in names:
         task = pack.spec.tasks[names.index(by)]
-        words = np.array([*task.classes, "(no label)"])[pack.column(f"{TASK}{by}")]
+        words = np.array([*task.classes, "(no label)"])[pack.column(f"label_{by}")]
         order = [*task.classes, "(no label)"]
     elif by in pack.table.column_names:
         words = pack.column(by).astype(str)
@@ -61,7 +56,9 @@ def strips(
         if len(rows):
             several = len(set(groups[rows]))
             apart = groups[rows] if several > 1 else pack.touch_groups[rows]
-            found.append(Strip(name, len(rows), several, _spread(rows, apart, num, rng)))
+            of = f", {several} {pack.spec.group_by}s" * (several > 1)
+            heading = f"{name}: {len(rows)} row{'s' * (len(rows) > 1)}{of}"
+            found.append((heading, _spread(rows, apart, num, rng)))
     if not found:
         raise ValueError(f"{pack.path} has no rows in split {split}: choose another")
     return found[:limit], len(found)
@@ -78,18 +75,11 @@ def _spread(rows: np.ndarray, groups: np.ndarray, num: int, rng: np.random.Gener
     return rows[order[np.argsort(keys, kind="stable")][:num]]
 
 
-def heading(strip: Strip, pack: Pack) -> str:
-    """Heading such as ``wood: 48 rows, 12 objects``."""
-    groups = f", {strip.num_groups} {pack.spec.group_by}s" * (strip.num_groups > 1)
-    return f"{strip.name}: {strip.num_rows} row{'s' * (strip.num_rows > 1)}{groups}"
-
-
-def to_image(pack: Pack, found: Sequence[Strip], num_all: int, *, side: int = 96) -> Image.Image:
+def to_image(pack: Pack, found: Sequence[tuple[str, np.ndarray]], num_all: int, *, side: int = 96) -> Image.Image:
     """All strips in one image."""
     left_out = f"; {num_all - len(found)} more not shown" * (num_all > len(found))
     title = f"{pack.spec.name}, {pack.num} rows at {pack.size} px; each pair: {contents(pack)}{left_out}"
-    blocks = [Block(heading(strip, pack), [Tile(pair(pack, int(row), side)) for row in strip.rows]) for strip in found]
-    return draw(title, blocks)
+    return draw(title, [(heading, [(pair(pack, int(row), side), "") for row in rows]) for heading, rows in found])
 
 
 def suspicious(pack: Pack, findings: Sequence[Finding]) -> list[Block]:
@@ -97,14 +87,80 @@ def suspicious(pack: Pack, findings: Sequence[Finding]) -> list[Block]:
     order = f"each pair: {contents(pack)}"
     wrong = [f for f in findings if f.rows and f.verdict in ("look", "broken")]
     if wrong:
-        return [
-            Block(f"{f.verdict}: {f.item}. {f.evidence} ({order})", _tiles(pack, f.rows[:NUM_SHOWN])) for f in wrong
-        ]
+        return [(f"{f.verdict}: {f.item}. {f.evidence} ({order})", _tiles(pack, f.rows[:NUM_SHOWN])) for f in wrong]
     num = min(NUM_SAMPLE, pack.num)
     rows = np.sort(np.random.default_rng(0).choice(pack.num, num, replace=False))
-    return [Block(f"No suspicious rows. {num} of {pack.num} rows, drawn at random ({order})", _tiles(pack, rows))]
+    return [(f"No suspicious rows. {num} of {pack.num} rows, drawn at random ({order})", _tiles(pack, rows))]
 
 
 def _tiles(pack: Pack, rows: Sequence[int] | np.ndarray) -> list[Tile]:
     ids, splits = pack.column("id").astype(str), pack.column("split").astype(str)
-    return [Tile(pair(pack, int(row), SIDE), f"{ids[row]} {splits[row]}") for row in rows]
+    return [(pair(pack, int(row), SIDE), f"{ids[row]} {splits[row]}") for row in rows]
+
+
+def pair(pack: Pack, row: int, side: int) -> np.ndarray:
+    """One row of a pack: camera, then each tactile sensor, uint8 [side, n side, 3]. A missing image is crossed out."""
+    blank = np.full((side, side, 3), MISSING, np.uint8)
+    line = np.eye(side, dtype=bool)
+    blank[line | line[::-1]] = CROSS
+    images = []
+    for m in pack.spec.modalities:
+        sensors = pack.spec.channels(m) // 3
+        there = pack.has(m)[row]
+        images += [side_by_side(fit(np.asarray(pack.images[m][row]), side))] if there else [blank] * sensors
+    return np.concatenate(images, axis=1)
+
+
+def contents(pack: Pack) -> str:
+    """The images of a pair, from left to right."""
+    sensors = pack.spec.touch_channels // 3
+    touch = {0: [], 1: ["touch"], 2: ["left touch", "right touch"]}.get(sensors, [f"{sensors} touch images"])
+    return ", ".join([*(["camera"] if pack.spec.vision_channels else []), *touch])
+
+
+def draw(title: str, blocks: Sequence[Block], *, width: int = 1280) -> Image.Image:
+    """Draw ``blocks`` below each other: a heading, then pictures in rows of equal length, with their captions.
+
+    ``width`` in pixels is kept if it has room for one picture.
+    """
+    cell = GAP + max((image.shape[1] for _, tiles in blocks for image, _ in tiles), default=480)
+    most = max([1, *(len(tiles) for _, tiles in blocks)])
+    columns = -(-most // -(-most // max(1, width // cell)))
+    room = max(columns * cell, min(width, 480))
+    bands = [_text(title, room, 13)]
+    for heading, tiles in blocks:
+        bands.append(_text(heading, room, 14))
+        bands += [_row(tiles[i : i + columns], cell, room) for i in range(0, len(tiles), columns)]
+    sheet = Image.new("RGB", (room + GAP, GAP + sum(band.height + GAP for band in bands)), "white")
+    top = GAP
+    for band in bands:
+        sheet.paste(band, (GAP, top))
+        top += band.height + GAP
+    return sheet
+
+
+def _row(tiles: Sequence[Tile], cell: int, room: int) -> Image.Image:
+    captions = [_text(caption, cell - GAP, 12) for _, caption in tiles]
+    height = max(len(image) for image, _ in tiles)
+    row = Image.new("RGB", (room, height + max(caption.height for caption in captions)), "white")
+    for place, ((image, _), caption) in enumerate(zip(tiles, captions, strict=True)):
+        row.paste(Image.fromarray(np.ascontiguousarray(image)), (place * cell, 0))
+        row.paste(caption, (place * cell, height))
+    return row
+
+
+def _text(text: str, width: int, size: int) -> Image.Image:
+    """Text in lines of about ``width`` pixels, at ``size`` pixels."""
+    lines = textwrap.wrap(text, max(1, int(width / (0.6 * size))))
+    picture = Image.new("RGB", (width, (size + 5) * len(lines)), "white")
+    for number, line in enumerate(lines):
+        ImageDraw.Draw(picture).text((0, number * (size + 5)), line, "#1d232b", _font(size))
+    return picture
+
+
+@cache
+def _font(size: int) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans, which comes with matplotlib."""
+    import matplotlib  # imported here: it is slow, and few commands draw
+
+    return ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", size)

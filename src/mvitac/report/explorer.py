@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable, Sequence
-from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -16,44 +15,18 @@ from mvitac.data.spec import task_title
 from mvitac.report.explorer_data import ExplorerData
 from mvitac.report.html import blocks as html
 from mvitac.report.html import picture
-from mvitac.report.palette import colour
 
 os.environ.setdefault("GRADIO_ANALYTICS_ENABLED", "False")  # no telemetry from a local page; read on import
 
-K = 6
+K = 6  # neighbours shown, as in explorer.css
+FILES = Path(__file__).parent
+STYLE = (FILES / "explorer.css").read_text()
 KEYS = "Arrow keys go from point to point, Enter shows its neighbours, + and - zoom, 0 resets."
 MAP = (
     f'<div class="map"><canvas tabindex="0" role="application" aria-label="Map of features. {KEYS}"></canvas>'
     '<div class="tip" aria-live="polite"></div></div>'
     '<div class="legend" role="group" aria-label="Shown in colour"></div><div class="count"></div>'
 )
-STYLE = """
-.map { position: relative; width: 100%; height: min(70vh, 560px, 110vw); }
-canvas { width: 100%; height: 100%; border: 1px solid var(--border-color-primary); touch-action: none; cursor: crosshair;
-         background: var(--background-fill-primary); color: var(--body-text-color); }
-canvas:focus-visible, button:focus-visible { outline: 3px solid #4fb0e2; outline-offset: 1px; }
-.tip { position: absolute; display: none; max-width: 260px; padding: 6px; font-size: 12px; pointer-events: none;
-       background: var(--background-fill-primary); color: var(--body-text-color); border: 1px solid #888; z-index: 5; }
-.tip img { width: 112px; height: 112px; object-fit: contain; image-rendering: pixelated; display: inline; }
-.legend { max-height: 14em; overflow-y: auto; margin-top: 4px; }
-.legend button { margin: 2px 2px 2px 0; padding: 2px 8px 2px 4px; font-size: 13px; font-weight: 400;
-                 color: var(--body-text-color); border: 1px solid transparent; border-radius: 4px;
-                 background: none; cursor: pointer; opacity: .7; }
-.legend button[aria-pressed=true] { border-color: var(--border-color-primary); opacity: 1; }
-.legend i { display: inline-block; width: 10px; height: 10px; margin-right: 5px; }
-.legend .bar { display: flex; align-items: center; gap: 6px; font-size: 13px; margin: 4px 0; }
-.legend .bar i { width: min(240px, 45vw); height: 12px; margin: 0; border-radius: 2px; }
-.count { font-size: 12px; opacity: .7; }
-"""
-FOUND = f"""
-h4 {{ margin: 0 0 6px; font-size: 14px; font-weight: 600; }}
-.found {{ display: grid; grid-template-columns: repeat({K}, minmax(0, 170px)); gap: 12px; }}
-@media (max-width: 700px) {{ .found {{ grid-template-columns: repeat(3, 1fr); gap: 8px; }} }}
-.found img {{ width: 100%; height: auto; border: 3px solid transparent; border-radius: 6px; image-rendering: pixelated; }}
-.found b, .found span {{ display: block; font-size: 12px; line-height: 1.35; overflow-wrap: anywhere; }}
-.found .right img {{ border-color: {colour("green")}; }}
-.found .wrong img {{ border: 3px dashed {colour("vermilion")}; }}
-"""
 
 
 def tip(land: ExplorerData, i: int) -> str:
@@ -68,7 +41,10 @@ def page(lands: dict[str, ExplorerData]) -> gr.Blocks:
     with gr.Blocks(title="mvitac explorer") as blocks:
         gr.HTML(f"<h3>{escape(' | '.join(lands))} on {escape(first.pack.spec.name)}</h3>")
         controls = _controls(first)
-        draw = partial(_maps, list(lands.values()))
+
+        def draw(modality: str, by: str, task: str | None, split: str, mistakes: bool) -> list[str]:
+            return [land.points(modality, by, split, task, mistakes=mistakes) for land in lands.values()]
+
         start = draw(*(c.value for c in controls))
         with gr.Row():
             views = [_map(name, land, s, len(lands) > 1) for (name, land), s in zip(lands.items(), start, strict=True)]
@@ -76,7 +52,7 @@ def page(lands: dict[str, ExplorerData]) -> gr.Blocks:
             "Click a point for its nearest neighbours; scroll or pinch to zoom, drag to pan, double-click to reset. "
             f"Choose in the legend what is shown in colour. With the map in focus: {KEYS[0].lower()}{KEYS[1:]}"
         )
-        galleries = [gr.HTML(css_template=FOUND) for _ in first.x]
+        galleries = [gr.HTML(css_template=STYLE) for _ in first.x]
         for control in controls:
             control.change(draw, controls, views)
         for view, land in zip(views, lands.values(), strict=True):
@@ -98,14 +74,7 @@ def _controls(land: ExplorerData) -> list[Any]:
         ]
 
 
-def _maps(
-    lands: Sequence[ExplorerData], modality: str, by: str, task: str | None, split: str, mistakes: bool
-) -> list[str]:
-    return [land.points(modality, by, split, task, mistakes=mistakes) for land in lands]
-
-
 def _map(name: str, land: ExplorerData, value: str, several: bool) -> Any:
-    """The map of one run, with its name if there are several."""
 
     def hover(row: int) -> str:
         return tip(land, int(row))
@@ -118,14 +87,13 @@ def _map(name: str, land: ExplorerData, value: str, several: bool) -> Any:
             value,
             html_template=MAP,
             css_template=STYLE,
-            js_on_load=(Path(__file__).parent / "scatter.js").read_text(),
+            js_on_load=(FILES / "scatter.js").read_text(),
             server_functions=[hover],
             elem_classes=["mvitac-map"],
         )
 
 
 def _on_click(land: ExplorerData) -> Callable[[str | None, gr.EventData], list[Any]]:
-    """A handler that shows the neighbours of the clicked point by each modality."""
 
     def click(task: str | None, event: gr.EventData) -> list[str]:
         i = int(event.row)

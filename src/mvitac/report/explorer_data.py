@@ -3,7 +3,6 @@
 Shapes: N rows of the pack, D features.
 """
 
-import base64
 import json
 from collections.abc import Sequence
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 import torch
 from matplotlib import colormaps, colors
 
+from mvitac.data.images import side_by_side
 from mvitac.data.pack import Pack
 from mvitac.deploy.publish import with_probes
 from mvitac.deploy.search import check_pack, nearest
@@ -19,10 +19,10 @@ from mvitac.evaluation.features import features, sample
 from mvitac.model import Model
 from mvitac.nn.linear_probe import ProbeInfo
 from mvitac.registry import unknown
-from mvitac.report.image_grid import side_by_side
 from mvitac.report.palette import COLOURS, MAP_HUES
 
 LEVELS = 32  # number of colours between the lowest and the highest value
+RAMP = [colors.to_hex(found) for found in colormaps["viridis"](np.linspace(0.0, 0.92, LEVELS))]  # seen on a light page
 
 
 class ExplorerData:
@@ -121,15 +121,14 @@ class ExplorerData:
         share = np.clip((values[index] - low) / max(high - low, 1e-12), 0, 1)
         levels = [str(level) for level in range(LEVELS)]
         group = np.where(np.isnan(share), LEVELS, np.nan_to_num(share) * (LEVELS - 1)).round()
-        legend = {"legend": [*levels, "not measured"], "coloured": levels, "hues": _ramp(LEVELS), "by": target}
+        legend = {"legend": [*levels, "not measured"], "coloured": levels, "hues": RAMP, "by": target}
         return self._json(modality, index, group, **legend, bar=[f"{low:.3g}", f"{high:.3g}", target])
 
     def _json(self, modality: str, index: np.ndarray, group: np.ndarray, **legend: Any) -> str:
         """The points ``index``, each with the number of its group in the legend."""
-        xy = (65535 * self.plane(modality)[index].T).astype("<u2")
-        points = {"xy": xy, "group": group.astype("<u2"), "row": index.astype("<i4")}
-        found = {name: _base64(array) for name, array in points.items()}
-        return json.dumps({**found, **legend, "gray": COLOURS["grey4"], "axes": self.axes(modality)})
+        x, y = self.plane(modality)[index].T.round(4).tolist()
+        points = {"x": x, "y": y, "group": group.astype(int).tolist(), "row": index.tolist()}
+        return json.dumps({**points, **legend, "gray": COLOURS["grey4"], "axes": self.axes(modality)})
 
     def neighbours(self, queries: np.ndarray, modality: str, k: int, without: int = -1) -> list[tuple[int, float]]:
         """(index, cosine) of the k rows nearest to a unit vector [1, D], without row ``without``."""
@@ -161,14 +160,5 @@ class ExplorerData:
         return side_by_side(self.pack.images[modality][int(self.rows[i])])
 
 
-def _ramp(num: int) -> list[str]:
-    """``num`` colours from low to high (viridis), without the end that vanishes on a light page."""
-    return [colors.to_hex(found) for found in colormaps["viridis"](np.linspace(0.0, 0.92, num))]
-
-
 def _unit(x: np.ndarray) -> np.ndarray:
     return (x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)).astype(np.float32)
-
-
-def _base64(array: np.ndarray) -> str:
-    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()

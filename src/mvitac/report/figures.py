@@ -4,11 +4,10 @@ No pyplot: no global state, nothing to close.
 """
 
 import io
-import math
-import textwrap
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -27,38 +26,14 @@ from mvitac.report.palette import CONTROL_GREYS, HUES, MODALITY_HUES, colour
 MARKERS = ("o", "^", "s", "D", "v", "P", "X", "*")
 DASHES = ("-", "--", ":", "-.")
 
-ONE_ANSWER = {"majority": ":", "mean": "--"}  # controls that give one answer for all rows, and their lines
 LEAST = -0.5  # where figures cut off R2, which has no lower limit
 WIDTH = 3.8  # inches. In the report's columns of about 360 px, 9 pt letters are then about 12 px high.
-STYLE: dict[Any, Any] = {
-    "text.parse_math": False,  # class names may contain a dollar sign
-    "text.color": colour("ink"),
-    "font.size": 9,
-    "svg.fonttype": "none",  # keep text as text
-    "figure.constrained_layout.use": True,
-    "axes.titlesize": 10,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.labelcolor": colour("soft"),
-    "axes.edgecolor": colour("rule"),
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.axisbelow": True,
-    **{f"{axis}tick.color": colour("soft") for axis in "xy"},
-    **{f"{axis}tick.major.size": 0 for axis in "xy"},
-    "grid.color": colour("rule"),
-    "grid.linewidth": 0.7,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "legend.handlelength": 1.4,
-    "legend.handletextpad": 0.5,
-    "legend.columnspacing": 1.2,
-}
+STYLE: Any = matplotlib.rc_params_from_file(Path(__file__).with_suffix(".mplstyle"), use_default_template=False)
 
 
-def new_figure(title: str, height: float) -> tuple[Figure, Axes]:
-    """Axes ``WIDTH`` wide."""
-    figure = Figure(figsize=(WIDTH, height))
+def new_figure(title: str, height: float, width: float = WIDTH) -> tuple[Figure, Axes]:
+    """Axes with a title, in inches."""
+    figure = Figure(figsize=(width, height))
     axes = figure.subplots()
     axes.set_title(shorten(title, 40))
     return figure, axes
@@ -76,15 +51,22 @@ def legend_below(figure: Figure, handles: Sequence[Any], labels: Sequence[str], 
 
 @matplotlib.rc_context(STYLE)
 def bars(
-    title: str, groups: Mapping[str, Mapping[str, Mapping[str, Any]]], lines: Mapping[str, float], what: str
+    title: str,
+    groups: Mapping[str, Mapping[str, Mapping[str, Any]]],
+    lines: Mapping[str, float],
+    what: str,
+    *,
+    width: float = WIDTH,
+    length: int = 22,
 ) -> Figure:
     """Horizontal bars in percent with 95 % whiskers. Methods have their modality's colour, controls are grey.
 
     ``groups``: modality or direction -> source -> mean, low and high, at most 1; ``low`` None: no whisker. ``lines``
-    are vertical ones across all groups, such as majority or chance. ``what`` labels the axis.
+    are vertical ones across all groups, such as majority or chance. ``what`` labels the axis. Names of sources have at
+    most ``length`` characters.
     """
     num_rows = sum(len(group) + 1.25 for group in groups.values())
-    figure, axes = new_figure(title, 0.85 + 0.21 * num_rows)
+    figure, axes = new_figure(title, 0.85 + 0.21 * num_rows, width)
     y, ticks, spans, top = 0.0, {}, [], max([0.0, *lines.values()])
     lows = [cell[k] for group in groups.values() for cell in group.values() for k in ("mean", "low")]
     least = max(LEAST, min(0.0, *(low for low in lows if low is not None)))
@@ -97,7 +79,7 @@ def bars(
         for source, cell in cells.items():
             y += 1
             _bar(axes, y, source, cell, hue, least)
-            ticks[y] = shorten(source, 22)
+            ticks[y] = shorten(source, length)
             top = max(top, cell["high"])
         y += 1.25
     axes.set_yticks(list(ticks), list(ticks.values()), color=colour("ink"))
@@ -133,57 +115,6 @@ def _bar(axes: Axes, y: float, source: str, cell: Mapping[str, Any], hue: str, l
     axes.annotate(percent(cell["mean"]) + leak_mark(cell.get("leak", "")), (high, y), xytext=(5, 0), **look)
 
 
-@matplotlib.rc_context({**STYLE, "font.size": 10})
-def comparison(lines: Sequence[Any]) -> Figure:
-    """A panel per task, a row per source, a dot with its 95 % interval per modality. Crosses are the paper's numbers.
-
-    ``lines`` are those of a table (``experiments.table.Line``). Methods are sorted by their best score in the first task,
-    the controls follow.
-    """
-    tasks = list(dict.fromkeys(task for line in lines for task in line.cells))
-    best: dict[tuple[bool, str], float] = {}
-    for line in (line for line in lines if line.modality != "none"):
-        score = line.cells[tasks[0]]["mean"] if tasks[0] in line.cells else -math.inf
-        best[line.control, line.source] = max(best.get((line.control, line.source), -math.inf), score)
-    rows = [source for _, source in sorted(best, key=lambda key: (not key[0], best[key]))]  # from below
-    names = [textwrap.fill(name, 40, max_lines=2, placeholder=" …") for name in rows]
-    figure = Figure(figsize=(3.4 + 3.2 * len(tasks), 1.5 + 0.42 * len(rows)))
-    for axes, task in zip(figure.subplots(1, len(tasks), sharey=True, squeeze=False)[0], tasks, strict=True):
-        axes.set_title(task)
-        cells = [(line.source, line.modality, line.cells[task]) for line in lines if task in line.cells]
-        for source, modality, cell in cells:
-            _dot(axes, source, modality, cell, rows)
-        axes.set_yticks(range(len(rows)), names, color=colour("ink"))
-        axes.set_ylim(-0.7, len(rows) - 0.3)
-        axes.axhline(sum(control for control, _ in best) - 0.5, color=colour("soft"), linewidth=0.7)
-        axes.set_xlabel(f"{'R2' if 'targets' in cells[0][2] else 'accuracy'} %")
-        axes.grid(axis="x")
-        axes.spines["left"].set_visible(False)
-    entries = {t: h for axes in figure.axes for h, t in zip(*axes.get_legend_handles_labels(), strict=True)}
-    order = [name for name in ("touch", "vision", "both", "printed", *ONE_ANSWER) if name in entries]
-    legend_below(figure, [entries[name] for name in order], order, 5)
-    return figure
-
-
-def _dot(axes: Axes, source: str, modality: str, cell: Mapping[str, Any], rows: Sequence[str]) -> None:
-    mean, low = cell["mean"], cell["low"]
-    at = 100 * max(LEAST, mean)
-    if modality == "none":
-        if source in ONE_ANSWER:
-            axes.axvline(at, color=colour("soft"), linewidth=1, linestyle=ONE_ANSWER[source], label=source)
-        return
-    hue = colour(MODALITY_HUES[modality])
-    y = rows.index(source) + {"touch": 0.22, "vision": 0.0, "both": -0.22}[modality]
-    if low is not None:
-        axes.plot([100 * max(LEAST, v) for v in (low, cell["high"])], [y, y], color=hue, linewidth=1.6)
-    marker = "o" if mean >= LEAST else "<"  # R2 may be lower than the axis goes
-    axes.plot(at, y, marker, markersize=4.5, color=hue, label=modality)
-    if mark := leak_mark(cell.get("leak", "")).strip():
-        axes.annotate(mark, (at, y), (5, 0), textcoords="offset points", va="center", fontsize=7, color=colour("ink"))
-    if cell.get("printed") is not None:
-        axes.plot(100 * cell["printed"], y, "x", markersize=6, color=hue, alpha=0.6, label="printed")
-
-
 @dataclass(frozen=True)
 class Line:
     """One curve: ``y`` over steps ``x``. Curves with the same label (seeds) share a legend entry."""
@@ -196,8 +127,10 @@ class Line:
 
 
 @matplotlib.rc_context(STYLE)
-def curves(title: str, lines: Sequence[Line], references: Mapping[str, float] | None = None) -> Figure:
-    """Curves over steps; ``references`` are horizontal lines such as chance."""
+def curves(
+    title: str, lines: Sequence[Line], references: Mapping[str, float] | None = None, x: str = "step", y: str = ""
+) -> Figure:
+    """Curves over steps, or over ``x``; ``references`` are horizontal lines such as chance."""
     figure, axes = new_figure(title, 2.75)
     handles: dict[str, Any] = {}
     several = len({line.label for line in lines}) < len(lines)  # seeds: thinner lines
@@ -206,19 +139,22 @@ def curves(title: str, lines: Sequence[Line], references: Mapping[str, float] | 
         look: dict[str, Any] = {"color": colour(line.hue), "marker": marker, "markersize": 3.2}
         (drawn,) = axes.plot(line.x, line.y, line.dash, linewidth=1.2 if several else 1.8, **look)
         handles.setdefault(line.label, drawn)
-        if line.x[0] == 0:  # the value before the first step
+        if x == "step" and line.x[0] == 0:  # the value before the first step
             look = {"color": colour(line.hue), "linestyle": "--", "linewidth": 0.9, "alpha": 0.6}
             handles["start"] = axes.axhline(line.y[0], zorder=0.9, **look)
     for number, (name, value) in enumerate((references or {}).items()):
         look = {"color": colour("soft"), "linestyle": DASHES[1 + number % 3], "linewidth": 1.1}
         handles[name] = axes.axhline(value, zorder=0.9, **look)
     axes.grid(axis="y")
-    axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+    axes.xaxis.set_major_locator(MaxNLocator(5, integer=x == "step"))
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.ticklabel_format(axis="y", useOffset=False)
     axes.margins(y=0.12)
-    axes.set_xlim(0, 1.04 * max(max(line.x) for line in lines))
-    axes.set_xlabel("step")
+    if x == "step":
+        axes.set_xlim(0, 1.04 * max(max(line.x) for line in lines))
+    else:
+        axes.set_ylim(bottom=0)
+    axes.set(xlabel=x, ylabel=y)
     labels = [shorten(label, 30) for label in handles]
     legend_below(figure, list(handles.values()), labels, 2 if max(map(len, labels)) > 18 else 3)
     return figure
@@ -260,6 +196,28 @@ def confusion(title: str, counts: np.ndarray, classes: Sequence[str]) -> Figure:
 
 
 @matplotlib.rc_context(STYLE)
+def predicted(title: str, points: Sequence[Sequence[float]], unit: str, hue: str) -> Figure:
+    """Predicted against true values (``points`` [N, 2]: true, predicted), with the line on which predictions are exact.
+
+    Predictions far outside the true range are drawn at the edge.
+    """
+    figure, axes = new_figure(title, 3.5)
+    true, guess = np.array(points, float).T
+    low, high = float(true.min()), float(true.max())
+    margin = 0.3 * max(high - low, 1e-9)
+    limits = low - margin, high + margin
+    axes.plot(limits, limits, color=colour("soft"), linewidth=1.1, linestyle=DASHES[1], zorder=0.9)
+    axes.scatter(true, np.clip(guess, *limits), s=11, alpha=0.6, linewidths=0, color=colour(hue))
+    axes.set(xlim=limits, ylim=limits, aspect="equal", xlabel=f"true, {unit}", ylabel=f"predicted, {unit}")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(5))
+    axes.grid()
+    exact = Line2D([], [], color=colour("soft"), linestyle=DASHES[1], linewidth=1.1)
+    legend_below(figure, [exact], ["exact"], 1)
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
 def feature_map(title: str, points: np.ndarray, labels: np.ndarray, classes: Sequence[str]) -> Figure:
     """Points [N, 2] by label [N] (-1 = unlabelled). Each further eight classes repeat the hues with another marker."""
     shown = [label for label in range(-1, len(classes)) if (labels == label).any()]
@@ -286,7 +244,7 @@ def feature_map(title: str, points: np.ndarray, labels: np.ndarray, classes: Seq
     return figure
 
 
-@matplotlib.rc_context({**STYLE, "svg.hashsalt": "mvitac"})  # the same figure is the same file
+@matplotlib.rc_context(STYLE)
 def _print(figure: Figure, kind: str, metadata: dict[str, Any], **options: Any) -> bytes:
     """Print the figure. It is laid out once for all kinds of file; savefig alone would repeat that."""
     for axes in figure.axes:

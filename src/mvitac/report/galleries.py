@@ -4,9 +4,8 @@ Shapes: features [N, D] of the rows shown; L2-normalised embeddings in the space
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,21 +26,15 @@ NUM_MAP, NUM_QUERIES, NUM_FOUND = 1500, 8, 5
 NUM_RANGES = 5  # of values, in the map
 
 
-@dataclass(frozen=True)
-class Found:
-    """One retrieved group, shown by its row nearest to the query. Rows are indices into the test rows."""
+class Query(NamedTuple):
+    """A query row, the rank of its own group (1 = first), and the groups found first. Rows are those of test.
 
-    row: int
-    mark: Literal["right", "same class", "wrong"]
-
-
-@dataclass(frozen=True)
-class Query:
-    """A query row, the rank of its own group (1 = first), and the groups found first."""
+    A group is shown by its row nearest to the query, and is right, same class or wrong.
+    """
 
     row: int
     rank: int
-    found: tuple[Found, ...]
+    found: list[tuple[int, str]]
 
 
 def nearest_groups(
@@ -64,8 +57,8 @@ def nearest_groups(
             members = torch.nonzero(groups == int(group))[:, 0]
             shown = int(members[(gallery[members] @ query[row]).argmax()])
             same = labels[shown] == labels[row] and labels[row] >= 0
-            hits.append(Found(shown, "right" if group == own else "same class" if same else "wrong"))
-        found.append(Query(int(row), int(ranks[row]) + 1, tuple(hits)))
+            hits.append((shown, "right" if group == own else "same class" if same else "wrong"))
+        found.append(Query(int(row), int(ranks[row]) + 1, hits))
     return found
 
 
@@ -143,13 +136,12 @@ def gallery(study: Study) -> list[Markup]:
 
 
 def _query(study: Study, rows: np.ndarray, asked: str, searched: str, query: Query, num_groups: int) -> Markup:
-    """One query and what it found."""
     image, name = _picture(study, asked, rows[query.row])
     rank = f"its {study.pack.spec.group_by} has rank {query.rank} of {num_groups}"
     cells = [html.cell("asked", image, "", f"{name}; {rank}")]
-    for found in query.found:
-        css, mark = _SHOWN[found.mark]
-        image, name = _picture(study, searched, rows[found.row])
+    for row, kind in query.found:
+        css, mark = _SHOWN[kind]
+        image, name = _picture(study, searched, rows[row])
         cells.append(html.cell(css, image, mark, name))
     return html.grid(cells, "query")
 

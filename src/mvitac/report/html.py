@@ -10,7 +10,7 @@ from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 from PIL import Image
 
-from mvitac.report.image_grid import side_by_side
+from mvitac.data.images import side_by_side
 from mvitac.report.palette import COLOURS
 
 _FILES = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True)

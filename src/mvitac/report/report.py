@@ -2,7 +2,6 @@
 
 import json
 import math
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
@@ -62,7 +61,10 @@ def write_report(
         raise ValueError(
             "the probe result is about other data than these runs: make it again with `mvitac probe --json`"
         )
-    _check_scored(runs, result)
+    scored = {Path(r["run"]).resolve() for r in [*result["records"], *result["retrieval"]] if "run" in r}
+    if scored and (other := scored ^ {run.path.resolve() for run in runs}):  # its means are of all of its runs
+        names = ", ".join(map(str, sorted(other)))
+        raise ValueError(f"the probe result and the report differ in {names}: make it again with `mvitac probe --json`")
     with shown(quiet=quiet):
         html = _page(Study(runs, pack, result, Path(out)))
     write_atomic(Path(out) / "report.html", lambda file: file.write(html.encode()))
@@ -87,14 +89,6 @@ def _probe(runs: Sequence[Finished], pack: Pack) -> dict[str, Any]:
     return {"data": pack.spec.name, "pack": pack.digest, "group_by": pack.spec.group_by, **shared}
 
 
-def _check_scored(runs: Sequence[Finished], result: dict[str, Any]) -> None:
-    """Check that the result is about exactly these runs: its means and names cover all of its runs."""
-    scored = {Path(r["run"]).resolve() for r in [*result["records"], *result["retrieval"]] if "run" in r}
-    if scored and (other := scored ^ {run.path.resolve() for run in runs}):
-        names = ", ".join(map(str, sorted(other)))
-        raise ValueError(f"the probe result and the report differ in {names}: make it again with `mvitac probe --json`")
-
-
 def _page(study: Study) -> str:
     title = f"{', '.join(study.sources)} on {study.pack.spec.name}"
     sections = {
@@ -109,7 +103,6 @@ def _page(study: Study) -> str:
         "gallery": ("Retrieval gallery", galleries.gallery),
         "settings": ("Settings", _settings),
         "cost": ("Cost", _cost),
-        "again": ("Reproduce", _again),
     }
     drawn = []
     with work("drawing the report", len(sections), "sections") as advance:
@@ -198,23 +191,13 @@ def flatten(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def _settings(study: Study) -> list[Markup]:
     each = [flatten(to_json(r.run)) for r in study.runs]
-    groups: dict[str, list[list[str]]] = {}
-    for key in dict.fromkeys(key for flat in each for key in flat):
-        values = list(dict.fromkeys(_plain(flat[key]) for flat in each if key in flat))
-        group, _, name = key.rpartition(".")
-        groups.setdefault(group or "run", []).append([name, "  |  ".join(values)])
-    order = ["run", *(group for group in groups if group != "run")]
-    shown = [page.table([group, ""], groups[group], words=True, label=group) for group in order]
+    names = [f"{r.source}, seed {r.run.seed}" for r in study.runs]
+    rows = [
+        [key, *(str(flat.get(key, "")) for flat in each)] for key in dict.fromkeys(k for flat in each for k in flat)
+    ]
+    shown = page.table(["", *names], rows, words=True, label="settings")
     records = [(f"{r.path / 'run.json'} in full", json.dumps(r.record, indent=1)) for r in study.runs]
-    folded = [page.fold(name, page.code(text)) for name, text in records]
-    differ = [page.paragraph("Where runs differ, all values are shown.")] * (len(study.runs) > 1)
-    return [*differ, page.grid(shown, "pillars"), *folded]
-
-
-def _plain(value: Any) -> str:
-    if value is None or isinstance(value, bool):
-        return {None: "none", True: "yes", False: "no"}[value]
-    return ", ".join(_plain(v) for v in value) if isinstance(value, list) else str(value)
+    return [page.fold("Every setting", shown), *(page.fold(name, page.code(text)) for name, text in records)]
 
 
 def _cost(study: Study) -> list[Markup]:
@@ -240,15 +223,3 @@ def _cost(study: Study) -> list[Markup]:
     names = [f"{r.source}, seed {r.run.seed}" for r in study.runs]
     shown = page.table(["", *names], [[name, *values] for name, values in rows.items()], words=True, label="cost")
     return [page.paragraph("Wall time is estimated from the logged speeds and excludes the final scoring."), shown]
-
-
-def _again(study: Study) -> list[Markup]:
-    folders = [str(r.path) for r in study.runs]
-    again = [f"{folder}-again" for folder in folders]
-    pairs = zip(folders, again, strict=True)
-    lines = [shlex.join(["mvitac", "pretrain", "--from", f"{a}/run.json", "--out", b]) for a, b in pairs]
-    lines += [shlex.join(["mvitac", "probe", *again]), shlex.join(["mvitac", "report", *again])]
-    commits = {str(r.record.get("commit") or "")[:12] for r in study.runs}
-    commit = f" at commit {commits.pop()}" if len(commits) == 1 and "" not in commits else ""
-    intro = f"With the versions in run.json{commit}, on data of the same digest:"
-    return [page.paragraph(intro), page.code("\n".join(lines))]

@@ -8,18 +8,14 @@ const left = 30, right = 12, top = 12, bottom = 30;  // margins around the point
 let data = { x: [], y: [], group: [], row: [], legend: [] }, view = { x: 0, y: 0, zoom: 1 }, hovered = -1, drag = null;
 let slots = [], ages = [], clock = 0;  // name and time of choice of the group in each colour
 
-function bytes(text) { return Uint8Array.from(atob(text), (c) => c.charCodeAt(0)); }
-
 function load() {
   const given = JSON.parse(props.value || "{}");
   if (given.row === undefined) return;
-  const xy = new Uint16Array(bytes(given.xy).buffer);
   if (given.by !== data.by) {  // another colouring; a filter keeps what was chosen
     slots = given.hues.map((_, k) => given.coloured[k] ?? null);
     ages = slots.map(() => clock++);
   }
-  data = { ...given, x: xy.subarray(0, xy.length / 2), y: xy.subarray(xy.length / 2),
-           group: new Uint16Array(bytes(given.group).buffer), row: new Int32Array(bytes(given.row).buffer) };
+  data = given;
   if (given.bar) legend.replaceChildren(bar(given));
   else legend.replaceChildren(...given.legend.map((name) => {
     const item = document.createElement("button");
@@ -71,8 +67,8 @@ function paint() {  // the legend
 }
 
 function place(i) {  // canvas position of point i, in CSS pixels
-  return [left + wide() * (0.5 + (data.x[i] / 65535 - 0.5 + view.x) * view.zoom),
-          top + high() * (0.5 + (data.y[i] / 65535 - 0.5 + view.y) * view.zoom)];
+  return [left + wide() * (0.5 + (data.x[i] - 0.5 + view.x) * view.zoom),
+          top + high() * (0.5 + (data.y[i] - 0.5 + view.y) * view.zoom)];
 }
 
 function wide() { return Math.max(1, canvas.clientWidth - left - right); }

@@ -18,9 +18,9 @@ from mvitac.evaluation.score_text import (
     with_interval,
 )
 from mvitac.evaluation.scores import by_cell, summarise_again
-from mvitac.report import figures, tables, value_figures
+from mvitac.report import figures, tables
 from mvitac.report.html import blocks as html
-from mvitac.report.palette import MODALITY_HUES
+from mvitac.report.palette import CONTROL_GREYS, MODALITY_HUES
 from mvitac.report.sections import WORDS, Study, headline
 
 
@@ -98,7 +98,6 @@ def _scores(study: Study, summary: dict[str, Any]) -> list[Markup]:
 
 
 def _target_table(study: Study, task: str, found: dict[str, Any]) -> Markup:
-    """R2 and mean absolute error of each target of one task."""
     rows: list[list[str]] = []
     for target, source, cells in tables.target_rows(found):
         if [target] not in rows:
@@ -152,12 +151,16 @@ def values(study: Study) -> list[Markup]:
             name = target["name"] if target["name"] == task else f"{task}: {target['name']}"
             hue, unit = MODALITY_HUES[modality], target["unit"]
             points = [pair for record in mine for pair in record["points"][t]]
-            drawing = value_figures.predicted(f"{name}, {WORDS[modality]}", points, unit, hue)
+            drawing = figures.predicted(f"{name}, {WORDS[modality]}", points, unit, hue)
             text = f"R2 {percent(target['mean'])} %, mean absolute error {error_text(target)}; {len(points)} test rows"
             text += f" of {len(mine)} seeds." if len(mine) > 1 else "."
             drawn.append(study.figure(f"predicted {name}", drawing, f"Predicted against true {name}. {text}", text))
-            ranges = {s: _mean_ranges(each, t) for s, each in {study.sources[0]: mine, **beside}.items()}
-            drawing = value_figures.error_ranges(f"{name}: error by range", ranges, unit, hue)
+            hues = [hue, *(CONTROL_GREYS.get(s, "soft") for s in beside)]
+            looks = [(own_hue, figures.DASHES[i % len(figures.DASHES)]) for i, own_hue in enumerate(hues)]
+            found_by = {study.sources[0]: mine, **beside}.items()
+            lines = [figures.Line(s, *_errors(each, t), *look) for (s, each), look in zip(found_by, looks, strict=True)]
+            labels = {"x": f"true, {unit}", "y": f"mean absolute error, {unit}"}
+            drawing = figures.curves(f"{name}: error by range", lines, **labels)
             alt = f"Mean absolute error of {name} by range of the true value"
             drawn.append(study.figure(f"error {name}", drawing, alt, "Ranges hold equally many test rows."))
     if not drawn:
@@ -168,7 +171,8 @@ def values(study: Study) -> list[Markup]:
     return [html.paragraph(intro), html.grid(drawn)]
 
 
-def _mean_ranges(records: Sequence[dict[str, Any]], t: int) -> list[dict[str, float]]:
-    """Error by range of target ``t``: mean over seeds, which share the ranges."""
-    each = [record["targets"][t]["ranges"] for record in records]
-    return [{**parts[0], "mae": sum(part["mae"] for part in parts) / len(parts)} for parts in zip(*each, strict=True)]
+def _errors(records: Sequence[dict[str, Any]], t: int) -> tuple[list[float], list[float]]:
+    """Middles of the ranges of the true value, and the error of target ``t`` there: mean over seeds, which share them."""
+    each = [*zip(*(record["targets"][t]["ranges"] for record in records), strict=True)]
+    middles = [(parts[0]["low"] + parts[0]["high"]) / 2 for parts in each]
+    return middles, [sum(part["mae"] for part in parts) / len(parts) for parts in each]

@@ -80,7 +80,8 @@ def retrieval(study: Study) -> list[Markup]:
     """R@5 as bars with chance level, and the whole table."""
     found = study.result["retrieval"]
     if not found:
-        return [html.paragraph(f"Not scored: {_why_no_retrieval(study)}.")]
+        needs = f"a space that both modalities share and {MIN_GALLERY} test {study.pack.spec.group_by}s with both"
+        return [html.paragraph(f"Not scored: it takes {needs}.")]
     groups: dict[str, dict[str, dict[str, float]]] = {}
     for (source, direction), records in tables.by_direction(found).items():
         mean, low, high = interval(records)
@@ -95,14 +96,6 @@ def retrieval(study: Study) -> list[Markup]:
     shown = html.table(columns, rows, muted=muted, label="retrieval")
     intro = f"Given one image, find its {by} among {num}, each represented by its mean embedding in the other modality."
     return [html.paragraph(intro), html.grid([drawn, shown], "beside")]
-
-
-def _why_no_retrieval(study: Study) -> str:
-    if len(study.pack.spec.modalities) < 2:
-        return "the data has one modality"
-    if all(len(run.model.projectors) < 2 for run in study.runs):
-        return "no method here has a space that both modalities share"
-    return f"it takes {MIN_GALLERY} test {study.pack.spec.group_by}s with both modalities, and this data has fewer"
 
 
 _NOT_LOSS = ("step", "lr", "pairs_per_s", "loss", "eval")
@@ -126,7 +119,6 @@ def loss(study: Study) -> list[Markup]:
 
 
 def _loss_parts(study: Study, source: str, series: Sequence[tuple[Finished, list[dict[str, Any]]]]) -> list[Markup]:
-    """A figure of the parts of one method's loss, if it logged several."""
     names = [name for name in series[0][1][0] if name not in _NOT_LOSS] if series else []
     if len(names) < 2:
         return []
@@ -142,7 +134,6 @@ def _loss_parts(study: Study, source: str, series: Sequence[tuple[Finished, list
 
 
 def _column(entries: list[dict[str, Any]], key: str) -> tuple[list[float], list[float]]:
-    """Steps and values of the entries with ``key``."""
     have = [entry for entry in entries if key in entry]
     # five digits, or float32 noise would set the axis of a constant curve
     return [entry["step"] for entry in have], [float(f"{entry[key]:.5g}") for entry in have]
@@ -151,9 +142,11 @@ def _column(entries: list[dict[str, Any]], key: str) -> tuple[list[float], list[
 def collapse(study: Study) -> list[Markup]:
     """What training measured on held-out groups: std, rank, alignment, uniformity, gap, kNN, R@5."""
     drawn = []
+    chances = [e["eval"]["chance R@5"] for r in study.runs for e in r.log if "chance R@5" in e.get("eval", {})]
     for title, keys, caption in _panels(study):
         if lines := _panel_lines(study, keys):
-            drawing = figures.curves(title, lines, _chance(study, title))
+            chance = {"chance": chances[0]} if title == "retrieval R@5" and chances else {}
+            drawing = figures.curves(title, lines, chance)
             drawn.append(study.figure(title, drawing, f"{title} over the steps. {caption}", caption))
     if not drawn:
         return []
@@ -187,7 +180,6 @@ def _panels(study: Study) -> list[tuple[str, dict[str, tuple[str, str]], str]]:
 
 
 def _panel_lines(study: Study, keys: dict[str, tuple[str, str]]) -> list[Line]:
-    """A curve per key and run; methods differ by their dashes."""
     lines = []
     for key, (label, hue) in keys.items():
         for r in study.runs:
@@ -197,19 +189,6 @@ def _panel_lines(study: Study, keys: dict[str, tuple[str, str]]) -> list[Line]:
                 dash = figures.DASHES[study.sources.index(r.source) % len(figures.DASHES)]
                 lines.append(Line(name, steps, values, hue, dash))
     return lines
-
-
-def _chance(study: Study, title: str) -> dict[str, float]:
-    """The chance level of a figure, if it has one."""
-    if title == "retrieval R@5":
-        found = [e["eval"]["chance R@5"] for r in study.runs for e in r.log if "chance R@5" in e.get("eval", {})]
-        return {"chance": found[0]} if found else {}
-    for task in study.pack.spec.tasks:
-        if title == f"kNN accuracy, {task.name}":
-            labels = study.pack.column(f"label_{task.name}")[study.pack.rows("val")].astype(int)
-            labels = labels[labels >= 0]
-            return {"majority": float(np.bincount(labels).max() / len(labels))} if len(labels) else {}
-    return {}
 
 
 def confusions(study: Study) -> list[Markup]:

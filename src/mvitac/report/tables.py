@@ -71,7 +71,6 @@ def _print_notes(result: dict[str, Any], records: Sequence[dict[str, Any]], file
 
 
 def _targets(name: str, task: dict[str, Any]) -> str:
-    """A table of R2 in percent and mean absolute error of each target."""
     rows, above = [], ""
     for target, source, cells in target_rows(task):
         scores = (f"{percent(cell['mean'])}, {error_text(cell)}" if cell else "" for cell in cells)
@@ -104,19 +103,6 @@ def print_retrieval(result: dict[str, Any], file: TextIO | None = None) -> None:
     columns = ("", "query -> found", *(f"{column} %" for column in RETRIEVAL))
     rows = retrieval_rows(result["retrieval"])
     print(text_table(f"retrieval over {unseen}", columns, rows, words=2), file=file)
-
-
-def print_sensors(result: dict[str, Any], file: TextIO | None = None) -> None:
-    """Print which touch sensors are new, which statistics were used, and what features tell of the sensor, if known."""
-    for line in result.get("statistics", ()):
-        print(line, file=file)
-    rows = []
-    for source, name in dict.fromkeys((r["source"], r["name"]) for r in result.get("sensors", ())):
-        found = [r for r in result["sensors"] if (r["source"], r["name"]) == (source, name)]
-        shown = [percent(sum(r[key] for r in found) / len(found)) for key in ("score", "chance")]
-        rows.append([source, "R@5: " * (name != "which sensor") + name, *shown])
-    if rows:
-        print(text_table("touch sensors", ["", "", "%", "chance %"], rows, words=2), file=file)
 
 
 def retrieval_rows(records: Sequence[dict[str, Any]]) -> list[list[str]]:

@@ -5,11 +5,10 @@ import errno
 import hashlib
 import json
 import os
-import platform
 import re
 import tempfile
-import threading
-import zlib
+import time
+import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -18,8 +17,8 @@ from typing import Any, BinaryIO
 def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, sync: bool = True) -> None:
     """Write a temporary file next to ``path``, then rename it to ``path``, so that no reader sees a partial file.
 
-    If it fails (full disk, Ctrl-C), the temporary file is removed and ``path`` is unchanged. Temporary files of processes
-    that were killed are removed by the next write to ``path`` (with ``sync``).
+    If it fails (full disk, Ctrl-C), the temporary file is removed and ``path`` is unchanged. Those of processes that were
+    killed are removed by a later write to ``path`` (with ``sync``).
 
     Args:
         path: The file to write. Missing folders are created.
@@ -27,7 +26,7 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, sync: bool 
         sync: Flush to disk, which protects against power loss. Without it, only a killed process is safe.
     """
     made = [parent for parent in path.parents if not parent.exists()]
-    neighbour = path.with_name(f".{path.name}.{_HERE}-{os.getpid()}-{threading.get_ident()}.tmp")
+    neighbour = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         if sync and not made:
             _remove_orphans(path)
@@ -50,8 +49,8 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, sync: bool 
         raise
 
 
-_HERE = f"{zlib.crc32(platform.node().encode()):08x}"  # this machine, in the names of temporary files
-_TEMPORARY = re.compile(r"\.(?P<name>.+?)\.((?P<machine>[0-9a-f]{8})-)?(?P<process>\d+)-\d+\.tmp")
+_TEMPORARY = re.compile(r"\.(.+)\.[0-9a-f]{32}\.tmp")
+_STALE = 600  # seconds after which nobody is still writing a temporary file
 
 
 def is_temporary(path: Path) -> bool:
@@ -60,24 +59,12 @@ def is_temporary(path: Path) -> bool:
 
 
 def _remove_orphans(path: Path) -> None:
-    """Remove temporary files of ``path`` whose process has ended; those of other machines are kept."""
+    """Remove temporary files of ``path`` that a killed process left."""
     for name in os.listdir(path.parent):
-        found = _TEMPORARY.fullmatch(name) if name.endswith(".tmp") else None
-        ours = found and found["name"] == path.name and found["machine"] in (None, _HERE)
-        if found and ours and not _is_alive(int(found["process"])):
-            path.with_name(name).unlink(missing_ok=True)
-
-
-def _is_alive(process: int) -> bool:
-    if os.name == "nt":  # signal 0 is Ctrl-C there
-        return True
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):  # it belongs to another user, or no process has this number
-        pass
-    return True
+        if name.endswith(".tmp") and (found := _TEMPORARY.fullmatch(name)) and found[1] == path.name:
+            with contextlib.suppress(FileNotFoundError):
+                if time.time() - path.with_name(name).stat().st_mtime > _STALE:
+                    path.with_name(name).unlink()
 
 
 @contextlib.contextmanager
@@ -139,8 +126,7 @@ def read_json(path: Path, what: str) -> Any:
         raise ValueError(f"{path} is not valid JSON ({brief(error)}): {what} is damaged") from None
     if isinstance(value, dict) and SEAL in value and value.pop(SEAL) != digest(value):
         raise ValueError(
-            f"{path} does not match its digest: {what} was damaged or edited: restore it, or delete it to make it again"
-            f' (to keep an edit, delete the entry "{SEAL}")'
+            f"{path} does not match its digest: {what} was damaged or edited (or delete the entry {SEAL!r})"
         )
     return value
 

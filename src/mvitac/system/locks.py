@@ -5,14 +5,11 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
 from mvitac.system.files import check_place, naming
-
-_held: ContextVar[frozenset[Path]] = ContextVar("_held", default=frozenset())  # paths whose locks this thread holds
 
 
 class Busy(ValueError):
@@ -27,11 +24,8 @@ def hold_lock(place: Path, busy: str, *, wait: bool, quiet: bool = False) -> Ite
     process holds it, ``wait`` for it after printing ``busy`` (unless ``quiet``), or raise ``Busy`` with that message.
     """
     place = place.absolute()
-    if place in _held.get():
-        yield
-        return
     # No soft lock: it would remain after a process is killed.
-    lock = FileLock(place.with_name(place.name + ".lock"), fallback_to_soft=False)
+    lock = FileLock(place.with_name(place.name + ".lock"), fallback_to_soft=False, is_singleton=True)
     try:
         lock.acquire(blocking=False)
     except Timeout:
@@ -43,12 +37,11 @@ def hold_lock(place: Path, busy: str, *, wait: bool, quiet: bool = False) -> Ite
     except OSError as error:
         if error.errno != errno.ENOSYS:
             raise
-    token = _held.set(_held.get() | {place})
     try:
         yield
     finally:
-        _held.reset(token)
-        Path(lock.lock_file).unlink(missing_ok=True)  # filelock detects a deleted lock file
+        if lock.lock_counter == 1:
+            Path(lock.lock_file).unlink(missing_ok=True)  # filelock detects a deleted lock file
         lock.release()
 
 

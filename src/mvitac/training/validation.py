@@ -17,7 +17,7 @@ from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, DataSpec, Task
 from mvitac.evaluation import diagnostics
-from mvitac.evaluation.pack_features import pack_features
+from mvitac.evaluation.features import pack_features
 from mvitac.methods.base import Method
 from mvitac.model import Model
 from mvitac.model_files import BEST

@@ -52,7 +52,10 @@ class File(Adapter):
         if file.suffix in (".safetensors", ".pth"):
             raise ValueError(f"{file} holds weights only: name their timm model with trunk=NAME, or an adapter")
         try:
-            opened = OnnxNetwork(file) if file.suffix == ".onnx" else _torchscript(file)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # torch.jit is deprecated; files of it are not
+                onnx = file.suffix == ".onnx"
+                opened = OnnxNetwork(file) if onnx else torch.jit.load(str(file), map_location="cpu").eval()
         except ImportError as error:
             raise ValueError(f"{file} needs {error.name}: pip install -e '.[export]' in mvitac's clone") from None
         except Exception as error:  # torch and onnxruntime have their own exceptions
@@ -61,12 +64,6 @@ class File(Adapter):
         if isinstance(opened, OnnxNetwork):
             made = replace(made, size=opened.size or made.size)
         return Loaded(Plain(opened, self.prefix), made, file.stem, files=(file,), source=file.name)
-
-
-def _torchscript(file: Path) -> nn.Module:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch.jit is deprecated; files of it are not
-        return torch.jit.load(str(file), map_location="cpu").eval()
 
 
 class OnnxNetwork(nn.Module):

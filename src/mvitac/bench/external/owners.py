@@ -8,10 +8,6 @@ names and shapes, which were read, as the preprocessing, from
     AnyTouch, 2       GeWu-Lab/AnyTouch @9c43a1a, GeWu-Lab/AnyTouch2 @d8a1147
     UniTouch          cfeng16/UniTouch @00d1bdc
     TVL               Max-Fu/tvl @f489503, huggingface.co/mlfu7/Touch-Vision-Language-Models
-    MViTac notebooks  ligerfotis/mvitac @a5b572d
-    CMC               fredfyyang/Touch-and-Go @d62e871
-
-The last two publish no weights: these are for files of one's own runs of their code.
 """
 
 import re
@@ -27,7 +23,7 @@ from torch import Tensor, nn
 
 from mvitac.bench.external.base import START, UNKNOWN, Adapter, Loaded
 from mvitac.bench.external.preprocessing import CLIP, IMAGENET, PLAIN, Preprocessing, Three
-from mvitac.bench.external.tower import HEAD, Tower, depth, fill, from_clip, patches, read_tensors, resnet, tower, under
+from mvitac.bench.external.tower import HEAD, Tower, depth, fill, from_clip, patches, read_tensors, tower, under
 from mvitac.nn.weights import State
 from mvitac.system.files import brief
 
@@ -239,34 +235,3 @@ class TVL(Owner):
         mean, std = (0.2917, 0.2971, 0.2910), (0.1876, 0.1947, 0.2187)
         made = Preprocessing(size=network.size, mean=mean, std=std, pad=True)
         return network, made, file.stem.removeprefix("tvl_enc_")
-
-
-class Notebooks(Owner):
-    """ResNets of the released MViTac notebooks, which number the stages of torchvision's (``4.0.conv1.weight``)."""
-
-    name: ClassVar[str] = "mvitac-notebooks"
-    expects: ClassVar[str] = "state_dict_tac or state_dict_vis (with reads=vision) of its notebooks"
-    about: ClassVar = ("MViTac notebooks", "https://github.com/ligerfotis/mvitac", UNKNOWN)
-
-    def build(self, *tensors: State) -> Built:
-        own = {re.sub(r"^[a-z]\w*\.", "", name): value for name, value in tensors[0].items()}  # with or without a name
-        stages = {"0": "conv1", "1": "bn1", "4": "layer1", "5": "layer2", "6": "layer3", "7": "layer4"}
-        return _resnet(under(own, "", stages), 256)
-
-
-class TouchAndGoCMC(Owner):
-    """ResNets of CMC of Touch and Go. Its random crops and flips at test time are left out."""
-
-    name: ClassVar[str] = "touch-and-go-cmc"
-    expects: ClassVar[str] = "a checkpoint of its CMC code, with reads=touch or reads=vision"
-    about: ClassVar = ("Touch and Go CMC", "https://github.com/fredfyyang/Touch-and-Go", UNKNOWN)
-
-    def build(self, *tensors: State) -> Built:
-        start = {"touch": "touch_to_image.", "vision": "image_to_touch."}[self.reads]
-        own = under(tensors[0], f"encoder.module.{start}")
-        return _resnet({name: value for name, value in own.items() if not name.startswith("fc.")}, 224)
-
-
-def _resnet(tensors: State, side: int) -> Built:
-    made = Preprocessing(size=(side, side), frames=tensors["conv1.weight"].shape[1] // 3)
-    return resnet(tensors), made, ""

@@ -1,4 +1,4 @@
-"""A vision transformer and a ResNet as checkpoint files describe them, and the reading of such files.
+"""A vision transformer as checkpoint files describe it, and the reading of such files.
 
 Widths and depths are taken from the file. A head has 64 channels in every transformer here, as in ViT-Ti, S, B and L.
 """
@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from timm.models.resnet import BasicBlock, Bottleneck, ResNet
 from timm.models.vision_transformer import Block
 from torch import Tensor, nn
 
@@ -38,10 +37,9 @@ def under(tensors: State, start: str, names: Mapping[str, str] = {}) -> State:
     return found
 
 
-def depth(tensors: State, start: str = "blocks.") -> int:
-    """Number of blocks: one more than the largest number after ``start``."""
-    found = (re.match(rf"{re.escape(start)}(\d+)\.", name) for name in tensors)
-    return 1 + max((int(match[1]) for match in found if match), default=-1)
+def depth(tensors: State) -> int:
+    """Number of blocks."""
+    return 1 + max((int(name.split(".")[1]) for name in tensors if name.startswith("blocks.")), default=-1)
 
 
 def fill(network: nn.Module, tensors: State) -> Any:
@@ -169,12 +167,3 @@ def tower(
         raise ValueError(f"positions for {num} places are no square grid at {time} steps of time")
     made: Tower = fill(Tower(tensors, (time, side, side), **options), tensors)
     return made if (size := sides(made.size)) == made.size else made.resize(size)
-
-
-def resnet(tensors: State) -> nn.Module:
-    """timm's ResNet that has ``tensors`` under its names, without a classifier."""
-    layers = tuple(depth(tensors, f"layer{i}.") for i in range(1, 5))
-    kind: Any = Bottleneck if "layer1.0.conv3.weight" in tensors else BasicBlock
-    channels = tuple(len(tensors[f"layer{i}.0.conv1.weight"]) for i in range(1, 5))
-    stem = tensors["conv1.weight"].shape[1]
-    return fill(ResNet(kind, layers, num_classes=0, in_chans=stem, channels=channels), tensors)

@@ -106,7 +106,6 @@ def residuals(one: ImageStats, sensors: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _some(rows: np.ndarray, num: int) -> np.ndarray:
-    """Return at most ``num`` of ``rows``, evenly spaced."""
     return rows if len(rows) <= num else rows[np.linspace(0, len(rows) - 1, num).astype(int)]
 
 

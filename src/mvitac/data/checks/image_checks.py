@@ -140,7 +140,6 @@ def _log_likelihood(values: np.ndarray, middle: np.ndarray, width: np.ndarray) -
 
 
 def _coarse(thumbs: np.ndarray) -> np.ndarray:
-    """Average [N, S, S, 3] over a 4 x 4 grid to [N, 48]."""
     step = thumbs.shape[1] // 4
     cut = thumbs[:, : 4 * step, : 4 * step].astype(np.float32)
     return cut.reshape(len(cut), 4, step, 4, step, 3).mean(axis=(2, 4)).reshape(len(cut), -1)
