@@ -104,13 +104,11 @@ def label_controls(pack: Pack, tasks: Sequence[AnyTask]) -> Records:
     for task in tasks:
         rows = split_rows(pack, task)
         if isinstance(task, Task):
-            name, answer = (
-                "majority",
-                np.eye(len(task.classes))[np.bincount(pack.labels(task.name)[rows.fitted]).argmax()],
-            )
+            answer = np.eye(len(task.classes))[np.bincount(pack.labels(task.name)[rows.fitted]).argmax()]
         else:
-            name, answer = "mean", np.nanmean(pack.values(task)[rows.fitted], axis=0)
-        found = {name: score_rows(pack, task, rows.test, np.tile(answer, (len(rows.test), 1)))}
+            answer = np.nanmean(pack.values(task)[rows.fitted], axis=0)
+        scores = score_rows(pack, task, rows.test, np.tile(answer, (len(rows.test), 1)))
+        found = {"majority" if isinstance(task, Task) else "mean": scores}
         for name, columns in pack.spec.controls.items():
             x = np.stack([pack.column(column)[rows.all].astype(float) for column in columns], axis=1)
             if np.isfinite(x).all():  # else rows of a part of a mix that has no such control
