@@ -31,8 +31,8 @@ def test_strips_hold_their_class_and_spread_over_groups(pack: Pack) -> None:
 
 
 def test_strips_by_column_and_split(pack: Pack) -> None:
-    found, num_all = contact_sheet.strips(pack, "group", limit=7, num=9)
-    assert len(found) == 7 and num_all == 60
+    found, num_all = contact_sheet.strips(pack, "group", num=9)
+    assert len(found) == 40 and num_all == 60
     assert all(len(rows) == 2 for _, rows in found)
     tested, _ = contact_sheet.strips(pack, "bright", split="test", num=50)
     assert set(pack.column("split")[np.concatenate([rows for _, rows in tested])]) == {"test"}

@@ -70,9 +70,6 @@ def test_errors_are_the_probes(land: ExplorerData, pack: Pack, artifact: Path) -
     wrong = np.flatnonzero(said.argmax(1).numpy() != pack.column("label_pattern"))
     assert 0 < len(wrong) < pack.num
     assert np.array_equal(land.shown("all", "pattern", mistakes=True), wrong)
-    value = json.loads(land.points("both", "error", "all", "pattern"))
-    named = np.array([value["legend"][c] for c in value["group"]])
-    assert np.array_equal(np.flatnonzero(named == "wrong"), wrong)
     assert "(probe: " in land.describe(int(wrong[0]))
 
 

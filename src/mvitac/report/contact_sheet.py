@@ -20,22 +20,23 @@ from mvitac.registry import unknown
 Tile = tuple[np.ndarray, str]  # a picture, uint8 [H, W, 3], and the text below it
 Block = tuple[str, Sequence[Tile]]  # pictures under one heading
 SIDE, NUM_SHOWN, NUM_SAMPLE = 96, 8, 24  # pixels; rows shown of a finding; rows shown if nothing is suspicious
+LIMIT = 40  # strips of a sheet
 GAP = 8  # pixels between pictures
 MISSING, CROSS = 225, 150  # gray levels of the tile that stands for a missing image
 
 
 def strips(
-    pack: Pack, by: str = "", *, split: str = "", num: int = 6, limit: int = 40, seed: int = 0
+    pack: Pack, by: str = "", *, split: str = "", num: int = 6, seed: int = 0
 ) -> tuple[list[tuple[str, np.ndarray]], int]:
     """Choose random rows of each value of the task or column ``by`` (default: the first task, else the group).
 
-    Of its ``num`` rows, those of different groups (within one group: touches) come first. Returns at most ``limit``
+    Of its ``num`` rows, those of different groups (within one group: touches) come first. Returns at most ``LIMIT``
     strips, each a heading such as ``wood: 48 rows, 12 objects`` and its rows, and their number without it.
     """
     if split and split not in SPLITS:
         raise unknown("split", split, SPLITS)
-    if num < 1 or limit < 1:
-        raise ValueError(f"num {num}, limit {limit}: give at least 1")
+    if num < 1:
+        raise ValueError(f"num {num}: give at least 1")
     names = [task.name for task in pack.spec.tasks]
     by = by or (names[0] if names else "group")
     if by in names:
@@ -61,7 +62,7 @@ def strips(
             found.append((heading, _spread(rows, apart, num, rng)))
     if not found:
         raise ValueError(f"{pack.path} has no rows in split {split}: choose another")
-    return found[:limit], len(found)
+    return found[:LIMIT], len(found)
 
 
 def _spread(rows: np.ndarray, groups: np.ndarray, num: int, rng: np.random.Generator) -> np.ndarray:

@@ -67,7 +67,7 @@ def _controls(land: ExplorerData) -> list[Any]:
         first = "label" if tasks else "split"
         return [
             gr.Dropdown(list(land.modalities), value=land.modalities[-1], label="features of", min_width=150),
-            gr.Dropdown(["label", "error", "split"], value=first, label="colour by", min_width=150),
+            gr.Dropdown(["label", "split"], value=first, label="colour by", min_width=150),
             gr.Dropdown(tasks, value=tasks[0] if tasks else None, label="task", min_width=150),
             gr.Dropdown(splits, value="test" if "test" in splits else "all", label="split", min_width=150),
             gr.Checkbox(False, label="mistakes only", container=False),

@@ -92,26 +92,21 @@ class ExplorerData:
         return np.flatnonzero(keep)
 
     def points(self, modality: str, colour: str, split: str, task: str | None, *, mistakes: bool = False) -> str:
-        """The map as JSON for scatter.js; ``colour`` is "label", "error" or "split". A target is coloured by its value."""
+        """The map as JSON for scatter.js; ``colour`` is "label" or "split". A target is coloured by its value."""
         index = self.shown(split, task, mistakes=mistakes)
         if task in self.values and colour != "split":
             return self._by_value(modality, index, task)
         if colour == "split" or task is None:
             names: Sequence[str] = sorted(set(self.split))
             values = np.searchsorted(names, self.split)
-        elif colour == "error":
-            names = ("right", "wrong", "unlabelled")
-            wrong = self.guess[task] != self.labels[task] if task in self.guess else np.zeros(len(self.rows), bool)
-            values = np.where(self.labels[task] < 0, 2, wrong.astype(int))
         else:
             names = (*self.classes[task], "unlabelled")
             values = np.where(self.labels[task] < 0, len(names) - 1, self.labels[task])
         used, counts = np.unique(values[index], return_counts=True)
-        hues = ("sky", "vermilion", "amber") if colour == "error" else MAP_HUES
-        largest = [u for u in np.argsort(-counts, kind="stable") if names[used[u]] != "unlabelled"][: len(hues)]
-        first = [names[0], names[1]] if colour == "error" else [names[used[u]] for u in sorted(largest)]
+        largest = [u for u in np.argsort(-counts, kind="stable") if names[used[u]] != "unlabelled"][: len(MAP_HUES)]
+        first = [names[used[u]] for u in sorted(largest)]
         legend: dict[str, Any] = {"legend": [str(names[v]) for v in used.tolist()], "coloured": first}
-        legend |= {"hues": [COLOURS[hue] for hue in hues], "by": task if colour == "label" else colour}
+        legend |= {"hues": [COLOURS[hue] for hue in MAP_HUES], "by": task if colour == "label" else colour}
         return self._json(modality, index, np.searchsorted(used, values[index]), **legend)
 
     def _by_value(self, modality: str, index: np.ndarray, target: str) -> str:
