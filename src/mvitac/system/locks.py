@@ -40,7 +40,7 @@ def hold_lock(place: Path, busy: str, *, wait: bool, quiet: bool = False) -> Ite
     try:
         yield
     finally:
-        if lock.lock_counter == 1:
+        if lock.lock_counter <= 1:  # not held once more by an outer block
             Path(lock.lock_file).unlink(missing_ok=True)  # filelock detects a deleted lock file
         lock.release()
 
