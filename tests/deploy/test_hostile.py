@@ -209,7 +209,7 @@ ARTIFACTS: dict[str, tuple[dict[str, Any], str]] = {
     "probe of sound": ({"about": put("probes", 0, "modality", value="sound")}, "is damaged"),
     "one class more": ({"about": put("probes", 0, "classes", value=["x"] * 4)}, "do not fit"),
     "wide probe": ({"probes": {WEIGHT: torch.zeros(3, 9)}}, "reads 9 features"),
-    "a number for a probe": ({"probes": {WEIGHT: torch.tensor(1.0)}}, r"weights of shape \(\)"),
+    "a number for a probe": ({"probes": {WEIGHT: torch.tensor(1.0)}}, r"weights \(\)"),
     "short bias": ({"probes": {BIAS: torch.zeros(2)}}, "do not fit 3 outputs"),
     "no numbers": ({"probes": {WEIGHT: torch.full((3, 64), torch.nan)}}, "not all finite"),
 }
