@@ -213,7 +213,7 @@ def test_windows_are_opened_where_the_data_has_an_order(pack: Pack, tmp_path: Pa
     assert plain is pack and "repeated" in still.notes[0]
     images = torch.from_numpy(frames.images["touch"][later]).permute(0, 3, 1, 2)
     assert not np.allclose(found, still.features("touch", images).numpy(), atol=1e-3)
-    with pytest.raises(ValueError, match="order of its frames"):
+    with pytest.raises(ValueError, match="name its order"):
         open_model(f"{text},stride=1").on(pack)
 
 
