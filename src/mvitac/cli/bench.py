@@ -12,6 +12,9 @@ from mvitac.bench.encoder import About, run_bench
 from mvitac.bench.result import problems, read_result, records_of
 from mvitac.bench.suite import find_suite, shipped
 from mvitac.cli.options import parse
+from mvitac.control import result as loop
+from mvitac.control.suite import find_suite as find_loop
+from mvitac.control.suite import shipped as loops
 from mvitac.evaluation.leaks import leaks_of
 from mvitac.evaluation.scores import summarise
 from mvitac.report.tables import print_summary
@@ -58,9 +61,15 @@ _MANUAL = """Score an encoder on every task of a suite, beside the same controls
 
 def bench(argv: list[str]) -> None:
     """mvitac bench MODEL... --suite NAME [--out DIR] [--data-root DIR]"""
-    options = parse(_Options, argv, "bench", description=_MANUAL.format(suites=", ".join(shipped())))
+    options = parse(_Options, argv, "bench", description=_MANUAL.format(suites=", ".join([*shipped(), *loops()])))
     if not options.models:
         raise ValueError("name the encoder: the folder of a run or an artifact (see mvitac bench --help)")
+    if options.suite in loops():
+        with shown():
+            path = loop.run_suite(options.models, find_loop(options.suite), options.out, options.about)
+        loop.print_result(loop.read_control(path))
+        print(f"written: {path}")
+        return
     suite = find_suite(options.suite)
     if options.data_root and not options.data_root.is_dir():
         raise ValueError(f"--data-root {options.data_root} is not a folder: give the one with the clones of real data")
@@ -83,7 +92,8 @@ def board(argv: list[str]) -> None:
     if not options.files:
         raise ValueError("name the results to compare (see mvitac bench board --help)")
     check_place(options.out)
-    print(f"written: {write_board(options.files, options.out)}")
+    write = loop.write_page if loop.is_result(options.files[0]) else write_board
+    print(f"written: {write(options.files, options.out)}")
 
 
 def check(argv: list[str]) -> None:
@@ -92,6 +102,10 @@ def check(argv: list[str]) -> None:
     if not options.files:
         raise ValueError("name the results to check (see mvitac bench check --help)")
     for path in options.files:
+        if loop.is_result(path):
+            value = loop.read_control(path)
+            print(f"{path}: {value['encoder']['name']} on {value['suite']['name']}: {len(value['rows'])} rows hold")
+            continue
         with fields_of(path):
             found = problems(result := read_result(path))
         if found:

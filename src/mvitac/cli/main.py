@@ -28,6 +28,7 @@ COMMANDS = {
     "bench": "bench:bench",
     "bench board": "bench:board",
     "bench check": "bench:check",
+    "ablate": "ablate:ablate",
     "report": "evaluate:report",
     "publish": "deploy:publish",
     "export": "deploy:export",

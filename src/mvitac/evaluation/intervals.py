@@ -83,6 +83,15 @@ def paired_difference(
     return mean, max(-most, mean - margin), min(most, mean + margin), p
 
 
+def mean_interval(values: np.ndarray) -> tuple[float, float, float, float]:
+    """Mean of ``values`` [seeds, groups], the ends of its 95 % interval over both, and the two-sided p of a mean of 0."""
+    sizes, mean = np.ones(values.shape[1]), float(values.mean())
+    groups, seeds = _over_groups(values.mean(0), sizes), _over_seeds(values, sizes)
+    margin = _margin(groups, seeds)
+    p = max(_p(mean, groups + seeds), _p(mean, seeds) if seeds.value else 0, least_p(values.shape[1]))
+    return mean, mean - margin, mean + margin, p
+
+
 def least_p(num_groups: int) -> float:
     """Smallest p of ``paired_difference``: that of a sign test over the groups."""
     return 2.0 ** (1 - num_groups)

@@ -1,0 +1,58 @@
+"""The closed-loop tasks as gymnasium environments (``pip install mvitac[control]``), so that others' policies run on them.
+
+import gymnasium, mvitac.control.env
+env = gymnasium.make("mvitac/Servo-v1", kind="corner")
+observation, _ = env.reset(seed=3)  # {"touch": uint8 [64, 64, 3]}
+"""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from mvitac.control.servo import SIZE, Episode, task_of
+from mvitac.control.suite import find_suite
+
+
+class ServoEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
+    """Follow the edge or the surface of one object of ``servo-v1``, kind straight, curved, corner or surface.
+
+    The seed of ``reset`` is the number of the object: 0 to 7 are those of the suite. An action in [-1, 1] is the part of
+    the largest correction of each component of the pose. The reward is minus the error in parts of the limit; the
+    episode is terminated when contact is lost. ``info`` has pose, mm and deg: no policy may read them.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 - gymnasium's name and type
+    render_mode = "rgb_array"
+
+    def __init__(self, kind: str = "straight", *, new_sensor: bool = False, noise: float = 1.0) -> None:
+        self.suite, self.kind = find_suite("servo-v1"), kind
+        self.task, self.asked = task_of(kind), {"new": new_sensor, "noise": noise}
+        self.observation_space = spaces.Dict({"touch": spaces.Box(0, 255, (SIZE, SIZE, 3), np.uint8)})
+        self.action_space = spaces.Box(-1, 1, (len(self.task.names),), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        number = int(self.np_random.integers(2**31)) if seed is None else seed
+        self.episode = Episode.begin(self.suite.seed, self.kind, number, **self.asked)
+        return self._seen(), self._info()
+
+    def step(self, action: np.ndarray) -> Any:
+        self.episode.move(self.suite.most * np.clip(action, -1, 1) * self.task.limit)
+        info, limit = self._info(), self.task.limit
+        reward = -(info["mm"] / limit[0] + info["deg"] / np.hypot.reduce(limit[1:]))
+        return self._seen(), float(reward), self.episode.lost, self.episode.step >= self.suite.steps, info
+
+    def render(self) -> np.ndarray:  # type: ignore[override]
+        return self.episode.touch()
+
+    def _seen(self) -> dict[str, np.ndarray]:
+        return {"touch": self.episode.touch()}
+
+    def _info(self) -> dict[str, Any]:
+        mm, deg = self.episode.error()
+        return {"pose": self.episode.pose, "mm": mm, "deg": deg}
+
+
+gymnasium.register("mvitac/Servo-v1", entry_point=ServoEnv)

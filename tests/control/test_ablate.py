@@ -1,0 +1,128 @@
+"""A policy that needs touch, one that ignores it, and one that only reacts to it are told apart."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mvitac.cli.main import main
+from mvitac.control.ablate import ablate, act, open_policy, read_episodes
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample, Source
+from mvitac.data.spec import DataSpec, Target, ValueTask
+
+STEPS = 24
+
+
+@dataclass
+class Presses(Source):
+    """Episodes in which a gel brightens with a force that changes slowly; the action is that force. Vision is a lamp."""
+
+    num: int = 8
+
+    def spec(self) -> DataSpec:
+        names = {"action": ["force", "turn"], "state": ["clock"]}
+        values = tuple(
+            ValueTask(name=n, targets=tuple(Target(name=c, unit="1") for c in cs)) for n, cs in names.items()
+        )
+        about: Any = {"vision_channels": 3, "touch_channels": 3, "tasks": (), "group_by": "episode"}
+        return DataSpec(name="presses", values=values, licence="none", source="this test", **about)
+
+    def items(self) -> list[str]:
+        return [str(i) for i in range(self.num)]
+
+    def fingerprint(self) -> dict[str, Any]:
+        return {"presses": self.num}
+
+    def samples_per_item(self) -> list[int]:
+        return [STEPS] * self.num
+
+    def read(self, item: int) -> list[Sample]:
+        rng = np.random.default_rng(item)
+        force = 60 * (1 + np.sin(np.arange(STEPS) / 3 + 2 * item)) * (np.arange(STEPS) > 5)
+        made = []
+        for step in range(STEPS):
+            images = [np.clip(rng.normal(v, 2, (16, 16, 3)), 0, 255).astype("u1") for v in (90, 60 + force[step])]
+            columns = {"id": f"{item}-{step:02d}", "group": f"{item}", "touch_group": f"{item}", "split": "test"}
+            columns |= {"frame": step, "force": force[step], "turn": float(step), "clock": step}
+            made.append(Sample(vision=images[0], touch=images[1], columns=columns))
+        return made
+
+
+@pytest.fixture(scope="module")
+def pack(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    return build(Presses(), tmp_path_factory.mktemp("episodes") / "pack", size=16, quiet=True)
+
+
+def needs(observation: dict[str, Any]) -> list[float]:
+    return [observation["touch"].mean() - 60.0, float(observation["state"][0])]
+
+
+def ignores(observation: dict[str, Any]) -> list[float]:
+    return [60.0, float(observation["step"])]
+
+
+class Fickle:
+    """Its action changes with touch at random, without any use; it counts its episodes."""
+
+    episodes = 0
+
+    def reset(self) -> None:
+        self.episodes += 1
+
+    def __call__(self, observation: dict[str, Any]) -> list[float]:
+        coin = np.random.default_rng(list(observation["touch"].tobytes()[:64])).normal()
+        return [60.0 + 20 * coin, float(observation["step"])]
+
+
+@pytest.mark.parametrize(
+    ("policy", "touch", "vision"),
+    [
+        (needs, "The policy uses", "The policy does not use"),
+        (ignores, "The policy does not use", "The policy does not use"),
+        (Fickle(), "Cannot tell", "The policy does not use"),
+    ],
+)
+def test_verdicts(pack: Pack, policy: Any, touch: str, vision: str) -> None:
+    result = ablate(policy, read_episodes(pack))
+    assert result["verdicts"]["touch"].startswith(touch)
+    assert result["verdicts"]["vision"].startswith(vision)
+    if isinstance(policy, Fickle):
+        assert policy.episodes == 8 * 9
+
+
+def test_each_replacement_gives_what_it_says(pack: Pack) -> None:
+    episodes = read_episodes(pack)
+    force = np.stack([episodes.actions[rows, 0] for rows in episodes.rows.values()])
+    felt = {
+        kind: np.stack([act(needs, episodes, "touch", kind, 4)[rows, 0] for rows in episodes.rows.values()])
+        for kind in ("", "mean frame", "another episode", "{} frames ago")
+    }
+    assert np.abs(felt[""] - force).max() < 1.5
+    assert np.allclose(felt["mean frame"], force.mean(), atol=1.5)
+    assert np.abs(felt["another episode"] - np.roll(force, -1, axis=0)).max() < 1.5
+    assert np.abs(felt["{} frames ago"][:, 4:] - force[:, :-4]).max() < 1.5
+    assert np.abs(felt["{} frames ago"][:, :5] - force[:, :1]).max() < 1.5
+
+
+def test_in_contact_and_over_time(pack: Pack) -> None:
+    rows = ablate(needs, read_episodes(pack))["rows"]
+    worse = next(row for row in rows if row["sense"] == "touch" and row["kind"] == "another episode")["parts"]
+    assert worse["in contact"][0] > 3 * abs(worse["no contact"][0])
+    assert worse["last"][0] > worse["first third"][0]
+
+
+def test_command(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("def policy(o):\n    return [o['touch'].mean() - 60, o['step']]\n")
+    assert main(["ablate", f"{file}:policy", "--data", str(pack.path), "--json", str(tmp_path / "a.json")]) == 0
+    assert "The policy uses touch" in capsys.readouterr().out
+    assert '"verdicts"' in (tmp_path / "a.json").read_text()
+    file.write_text("def policy(o):\n    return [0.0]\n")
+    assert main(["ablate", f"{file}:policy", "--data", str(pack.path)]) == 2
+    assert "gives 1 numbers" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="no function other"):
+        open_policy(f"{file}:other")

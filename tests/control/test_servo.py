@@ -1,0 +1,171 @@
+"""Following edges and surfaces: poses and corrections agree, results repeat, and changed results are refused."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mvitac.bench.encoder import About
+from mvitac.bench.result import VOLATILE
+from mvitac.cli.main import main
+from mvitac.control import result, suite
+from mvitac.control.servo import TASKS, Edge, Episode, Surface, presses, task_of, textures
+from mvitac.control.servo_rows import Servo
+from mvitac.control.suite import Condition, find_suite
+from mvitac.system.files import digest
+
+RANDOM = "external:timm/test_resnet,weights=random,size=32,seed={}"
+KINDS = [kind for task in TASKS.values() for kind in task.kinds]
+
+
+@pytest.fixture(scope="module")
+def small() -> suite.ServoSuite:
+    few: Any = {"shapes": 2, "steps": 6, "settle": 2, "fit_shapes": 6, "fit_presses": 4, "fit_val": 2, "epochs": 1}
+    texts = tuple(map(RANDOM.format, range(2)))
+    late = (Condition(name="known sensor"), Condition(name="late", latency_ms=50, new_sensor=True))
+    return replace(find_suite("servo-v1"), name="small-v1", **few, untrained=texts, conditions=late)
+
+
+@pytest.fixture(scope="module")
+def done(small: suite.ServoSuite, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("servo")
+    return result.run_suite([RANDOM.format(5)], small, out, About(name="five"))
+
+
+@pytest.fixture(autouse=True)
+def known(monkeypatch: pytest.MonkeyPatch, small: suite.ServoSuite, request: pytest.FixtureRequest) -> None:
+    """The small suite is one of this version."""
+    find = suite.find_suite
+    for module in (result, suite):
+        monkeypatch.setattr(module, "find_suite", lambda name: small if name == small.name else find(name))
+    monkeypatch.setattr(result, "shipped", lambda: [small.name])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_correction_changes_the_pose_by_itself(kind: str) -> None:
+    task = task_of(kind)
+    start = Episode.begin(0, kind, 1)
+    change = np.array([0.1, 2.0, -3.0])[: len(task.names)]
+    moved, still = (task.moved(start.shape, start.state, c) for c in (change, 0 * change))
+    difference = task.pose(start.shape, moved) - task.pose(start.shape, still)
+    assert np.allclose(difference, change, atol=[0.02, *[0.3] * (len(change) - 1)])
+
+
+def test_poses_mean_what_their_names_say() -> None:
+    straight = Episode.begin(0, "straight", 0).shape
+    assert np.allclose(Edge.pose(straight, np.array([7.0, 1.5, np.radians(-20)])), [1.5, 20])
+    wavy = Episode.begin(0, "surface", 0).shape
+    at = Surface.state(wavy, np.array([0.4, 3.0, -2.0]), 12.0)
+    assert np.allclose(Surface.pose(wavy, at), [0.4, 3.0, -2.0])
+    step = np.array([1e-3, -1e-3])
+    slope = np.diff(wavy.height(12 + step, np.zeros(2)))[0] / -2e-3  # the tilt is what the surface adds to the gel's
+    assert np.degrees(np.arctan(slope) - np.arctan(at[2])) == pytest.approx(3.0, abs=0.01)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_true_pose_stays_on_and_no_touch_does_not(kind: str) -> None:
+    task = task_of(kind)
+    for known in (True, False):
+        errors = []
+        for number in range(8):
+            episode = Episode.begin(0, kind, number)
+            for _ in range(60):
+                episode.move(-0.5 * (episode.pose - task.target) * known)
+            errors.append(episode.error()[0])
+        assert (np.mean(errors) < 0.15) == known
+
+
+def test_pictures_show_the_pose_and_repeat() -> None:
+    one, other = Episode.begin(0, "straight", 2), Episode.begin(0, "straight", 2, new=True)
+    assert np.array_equal(one.touch(), one.touch())
+    assert other.copy.sensor.held_out and np.array_equal(one.state, other.state)
+    before = one.touch().astype(float)
+    one.move(np.array([1.0, 0.0]))
+    assert np.abs(one.touch() - before).mean() > 1
+    assert not set(textures(True)) & set(textures(False)) and textures(False)
+
+
+def test_presses_cover_what_probes_need() -> None:
+    for name, task in TASKS.items():
+        poses = np.concatenate([presses(name, 0, 8, number)[1] for number in range(3)])
+        assert (np.abs(poses - task.target) < 1.25 * task.reach).all()
+        assert (poses.std(0) > task.reach / 4).all()
+
+
+def test_a_result_repeats_and_says_how_good_each_row_is(
+    done: Path, small: suite.ServoSuite, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    value = result.read_control(done)
+    again = result.read_control(result.run_suite([RANDOM.format(5)], small, tmp_path, About(name="five")))
+    assert value["digest"] == again["digest"]
+    scores = result.scores(value)
+    assert {"five", "true pose", "no touch", "pixels", "untrained", "end to end", "touch shuffled"} <= scores.keys()
+    for kind in KINDS:
+        assert scores["true pose"][kind, "all", "mm"].mean() < scores["no touch"][kind, "all", "mm"].mean()
+    assert scores["untrained"]["surface", "late", "mm"].shape == (2, 2)
+    assert main(["bench", "check", str(done)]) == 0
+    assert main(["bench", "board", str(done), "--out", str(tmp_path / "board.html")]) == 0
+    assert "true pose" in (tmp_path / "board.html").read_text()
+    assert f"{len(value['rows'])} rows hold" in capsys.readouterr().out
+
+
+def _better(value: dict[str, Any]) -> None:
+    value["rows"][0]["cells"][0]["mm"][0] = -1.0
+
+
+def _true(value: dict[str, Any]) -> None:
+    next(row for row in value["rows"] if row["source"] == "true pose")["cells"][3]["mm"][0] += 0.5
+
+
+def _late(value: dict[str, Any]) -> None:
+    value["suite"]["conditions"][1]["latency_ms"] = 0
+    value["suite_digest"] = digest(value["suite"])
+
+
+CHANGES = {
+    "no episodes give": _better,
+    "other sums here": _true,
+    "the suite asks for": lambda value: value["rows"].pop(3),
+    "not of this version's": _late,
+    "other tasks": lambda value: value["rows"][0]["cells"].pop(),
+}
+
+
+@pytest.mark.parametrize("why", CHANGES)
+def test_changed_results_are_refused(done: Path, tmp_path: Path, why: str) -> None:
+    value = json.loads(done.read_text())
+    CHANGES[why](value)
+    path = tmp_path / "changed.json"
+    path.write_text(json.dumps(value))
+    with pytest.raises(ValueError, match="does not match its digest"):
+        result.read_control(path)
+    value["digest"] = digest({key: part for key, part in value.items() if key not in VOLATILE})
+    path.write_text(json.dumps(value))
+    with pytest.raises(ValueError, match=why):
+        result.read_control(path)
+
+
+def test_latency_and_shuffling_hurt(small: suite.ServoSuite) -> None:
+    long = replace(small, steps=40, settle=10, shapes=6, conditions=(Condition(name="a"),))
+    late = replace(long, conditions=(Condition(name="a", latency_ms=150),))
+    mm = [np.mean(Servo(each).run(None)[2]["mm"]) for each in (long, late)]
+    assert mm[1] > 1.5 * mm[0]
+
+
+def test_gymnasium_environment() -> None:
+    gymnasium = pytest.importorskip("gymnasium")
+    from gymnasium.utils.env_checker import check_env
+
+    import mvitac.control.env
+
+    env = gymnasium.make("mvitac/Servo-v1", kind="curved").unwrapped
+    check_env(env, skip_render_check=True)
+    env.reset(seed=1)
+    for _ in range(60):
+        pose = env.episode.pose  # a policy that cheats
+        *_, lost, over, info = env.step((-0.5 * pose / (0.2 * Edge.limit)).astype(np.float32))
+    assert over and not lost and info["mm"] < 0.2
+    assert mvitac.control.env.ServoEnv
