@@ -26,7 +26,8 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.deploy.engine import Call, Engine, Runtime, cosines
-from mvitac.deploy.export import ExportConfig, Precision, export
+from mvitac.deploy.export import export
+from mvitac.deploy.export_config import ExportConfig, Precision
 from mvitac.deploy.export_module import ExportModule
 from mvitac.model_files import fresh
 from mvitac.nn.encoders import Encoders

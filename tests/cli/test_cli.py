@@ -1,20 +1,88 @@
 """The command line: quick to answer, a help that is a golden file, and the whole road in one process."""
 
 import json
+import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 from mvitac.cli.main import COMMANDS, HELP, main
+from mvitac.data.pack import Pack
+from mvitac.datasets import DatasetConfig, dataset
+from mvitac.registry import default
 from mvitac.run import Run
+from mvitac.training.loop import Interrupted
 
 
 def test_importing_the_package_imports_no_torch() -> None:
     code = "import sys, mvitac; print('torch' in sys.modules, 'numpy' in sys.modules)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.split() == ["False", "False"]
+
+
+WRONG = (
+    "pretrain --data materials --recipe nosuch",
+    "pretrain --data packs/nosuch",
+    "finetune nosuch --data mateials",
+    "compare --plan nosuch",
+    "demo --recipe nosuch",
+    "probe nosuch",
+    "probe --folds 1",
+    "probe --nosuch",
+    "report nosuch",
+    "publish nosuch out",
+    "export nosuch --out out",
+    "predict nosuch touch.mp4",
+    "live nosuch",
+    "embed pack --model nosuch --out out",
+)
+
+
+def test_wrong_arguments_are_refused_before_torch_is_imported() -> None:
+    code = (
+        "import sys; from mvitac.cli.main import main\n"
+        f"for command in {WRONG!r}:\n    print(main(command.split()), 'torch' in sys.modules, command)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == [f"2 False {command}" for command in WRONG]
+    assert all(word in done.stderr for word in ("nosuch", "mateials", "folds 1"))
+
+
+@pytest.mark.parametrize(
+    ("words", "again"),
+    [
+        ("pretrain --data packs/a --out 'my run'", " --resume"),
+        ("finetune imagenet --resume", ""),
+        ("compare --seeds 3", ""),
+    ],
+)
+def test_what_is_stopped_says_the_command_that_goes_on(
+    words: str, again: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for error in (Interrupted("stopped after step 4 of 8; a folder"), KeyboardInterrupt()):
+        monkeypatch.setattr("mvitac.cli.main._run", Mock(side_effect=error))
+        assert main(shlex.split(words)) == 130
+        assert capsys.readouterr().err.endswith(f"; continue: mvitac {words}{again}\n")
+
+
+def test_a_path_is_data(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pack, a table, a folder, a tar; a name of a dataset is that, also beside a folder of this name."""
+    (tmp_path / "pairs.csv").touch()
+    (tmp_path / "a.tar").touch()
+    (tmp_path / "robot" / "meta").mkdir(parents=True)
+    (tmp_path / "robot" / "meta" / "info.json").touch()
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "materials").mkdir()
+    found = {"pairs.csv": "folder", "a.tar": "webdataset", "robot": "lerobot", str(pack.path): "pack", ".": "folder"}
+    for path, name in found.items():
+        assert dataset(path) == replace(default(DatasetConfig, name), path=Path(path))
+    assert dataset("materials") == default(DatasetConfig, "materials")
+    with pytest.raises(ValueError, match=r"unknown dataset 'pairs\.cvs'"):
+        dataset("pairs.cvs")
 
 
 def test_help_names_every_command_in_80_columns() -> None:
@@ -45,7 +113,7 @@ def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
     summary = json.loads((tmp_path / "demo" / "summary.json").read_text())
     for modality in ("touch", "vision", "both"):
         cell = summary["category"][modality]["mvitac"]
-        assert set(cell) == {"mean", "low", "high", "seeds", "groups"} and cell["seeds"] == [0, 1]
+        assert set(cell) - {"balanced"} == {"mean", "low", "high", "seeds", "groups"} and cell["seeds"] == [0, 1]
         assert cell["low"] <= cell["mean"] <= cell["high"]
     force = summary["force"]  # a value, next to the classes
     assert set(force) == {"none", "touch", "vision", "both"} and set(force["none"]) == {"mean"}

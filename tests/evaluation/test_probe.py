@@ -5,6 +5,7 @@ import dataclasses
 import io
 import re
 import shutil
+import textwrap
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,16 +28,19 @@ from mvitac.evaluation.classifiers import fit_knn, fit_linear, fit_papers, train
 from mvitac.evaluation.controls import borders, controls_of, frozen_trunks, imagenet_trunk, starts_of, thumbnails
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.few_labels import few
+from mvitac.evaluation.folds import fold_splits
+from mvitac.evaluation.leaks import read_sources
 from mvitac.evaluation.probe import probe_all, probe_features, probe_model, split_rows
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.run_names import names_of
+from mvitac.evaluation.score_text import verdicts
 from mvitac.evaluation.scores import summarise
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model_files import fresh, load
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders
 from mvitac.recipes import recipe, with_method
 from mvitac.report.report import open_runs
-from mvitac.report.tables import print_retrieval, print_summary
+from mvitac.report.tables import print_classes, print_retrieval, print_summary
 from mvitac.run import Optim, Run
 from mvitac.system.device import Hardware
 from mvitac.system.files import read_json
@@ -146,8 +150,43 @@ def test_every_score_has_its_controls(result: dict) -> None:
         assert result["summary"][task]["touch"]["mvitac"]["seeds"] == [0, 1]
     print_summary(result, file := io.StringIO())
     print_retrieval(result, file)
+    print_classes(result, file)
     text = file.getvalue()
     assert "majority" in text and re.search(r"mvitac +touch -> vision", text)
+    for task, summary in result["summary"].items():
+        assert all(textwrap.fill(line, 80, subsequent_indent="  ") in text for line in verdicts(summary))
+        for one in result["per_class"][task]["both"]:
+            cells = [
+                "-" if v is None else f"{100 * v:.1f}"
+                for s in ("mvitac", "untrained", "pixels")
+                for v in one["scores"][s]
+            ]
+            row = [one["class"], str(one["rows"]), str(one["groups"]), *cells]
+            assert row in [line.replace(" / ", " ").split() for line in text.splitlines()]
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_folds_test_every_group_once_that_no_run_learned_from(pack: Pack, runs: list[Path], tmp_path: Path) -> None:
+    """Each class in each fold; the seven tenths that were trained on are fitted on, or the folds are of all, elsewhere."""
+    groups = pack.column("group").astype(str)
+    learned = set(groups[pack.rows("train")])
+    task = pack.spec.tasks[0]
+    for sources, free in (((read_sources(runs[0]) or []), set(groups) - learned), ([], set(groups))):
+        splits = fold_splits(pack, task, 3, sources)
+        tested = [set(groups[split == "test"]) for split in splits]
+        assert sorted(group for each in tested for group in each) == sorted(free)
+        for split, each in zip(splits, tested, strict=True):
+            assert not each & set(groups[split == "train"]) and len(each | set(groups[split == "train"])) == 60
+            assert min(np.bincount(pack.labels(task.name)[split == "test"], minlength=3)) > 0
+    with pytest.raises(ValueError, match=r"task 'pattern' has 60 instances .* give --folds 2 to 60"):
+        fold_splits(pack, task, 61, [])
+    before = (runs[0] / "probe.json").exists()
+    found = probe_runs(runs, ProbeConfig(folds=3, tasks=("pattern", "bright"), modalities=("touch",)))
+    num = len(pack.rows("val", "test"))
+    assert {(r["num_test"], sum(r["group_sizes"])) for r in found["records"]} == {(num, num)} and not found["leaks"]
+    assert found["summary"]["pattern"]["touch"]["mvitac"]["groups"] == 60 - len(learned)
+    assert {"mvitac", "untrained", "pixels", "border"} <= found["summary"]["pattern"]["touch"].keys()
+    assert (runs[0] / "probe.folds.json").exists() and (runs[0] / "probe.json").exists() == before
 
 
 def test_majority_is_the_share_of_trains_commonest_class(pack: Pack, result: dict) -> None:

@@ -8,11 +8,12 @@ import torch
 from benchmarks.calibration import rates_of_error, value_rates_of_error
 from scipy.stats import t as student
 from sklearn.linear_model import Ridge
-from sklearn.metrics import confusion_matrix, f1_score
+from sklearn.metrics import confusion_matrix, f1_score, precision_score, recall_score
 
 from mvitac.evaluation import diagnostics as d
+from mvitac.evaluation import score_text
 from mvitac.evaluation.intervals import interval, least_p, paired_difference
-from mvitac.evaluation.scores import score
+from mvitac.evaluation.scores import per_class, score, summarise
 
 
 def record(correct: list[int], seed: int | None, sizes: int = 10) -> dict:
@@ -62,6 +63,64 @@ def test_scores_of_one_probe_are_scikit_learns() -> None:
     assert found["macro_f1"] == f1_score(y, answers, labels=[0, 1, 3], average="macro", zero_division=0)
     assert found["accuracy"] == (y == answers).mean()
     assert found["balanced_accuracy"] == pytest.approx(np.mean([(answers[y == k] == k).mean() for k in (0, 1, 3)]))
+    assert found["class_groups"] == [len({i // 4 for i in np.flatnonzero(y == k)}) for k in range(5)]
+
+
+def told(source: str, seed: int | None, y: np.ndarray, answers: np.ndarray, modality: str = "both") -> dict:
+    known = {"task": "t", "modality": modality, "source": source, "seed": seed, "probe": "linear"}
+    return {**known, **score(y, np.eye(4)[answers], np.arange(len(y)) // 4, 4)}
+
+
+def test_each_class_has_scikit_learns_precision_and_recall_over_seeds() -> None:
+    """None where there is nothing to divide by; counts are those of one seed."""
+    rng = np.random.default_rng(1)
+    y, each = rng.choice([0, 1, 2], 40), [rng.choice([0, 1, 3], 40) for _ in range(2)]
+    records = [told("mvitac", seed, y, answers) for seed, answers in enumerate(each)]
+    records.append(told("majority", None, y, np.zeros(40, int), "none"))
+    found = per_class(records, {"t": list("abcd")}, "linear")["t"]
+    assert [one["class"] for one in found["both"]] == list("abcd")
+    assert [one["rows"] for one in found["both"]] == [*np.bincount(y).tolist(), 0]
+    assert [one["groups"] for one in found["none"]] == records[0]["class_groups"]
+    twice = np.concatenate([y, y]), np.concatenate(each)
+    for k, one in enumerate(found["both"]):
+        only = {"labels": [k], "average": None, "zero_division": np.nan}
+        wanted = [float(f(*twice, **only)[0]) for f in (precision_score, recall_score)]
+        assert one["scores"]["mvitac"] == [None if np.isnan(w) else pytest.approx(w) for w in wanted]
+    assert found["none"][0]["scores"]["majority"][1] == 1.0
+
+
+def test_uneven_classes_show_what_accuracy_hides() -> None:
+    """70 % by saying one class: every class counts alike in a second row, of all sources, and not where they are even."""
+    y = np.repeat([0, 1], [28, 12])
+    summary = summarise([told("mvitac", 0, y, np.zeros(40, int)), told("untrained", 0, y, y)])["t"]
+    assert score_text.balanced_rows(summary, ["both"]) == [
+        ["mvitac, balanced", "50.0"],
+        ["untrained, balanced", "100.0"],
+    ]
+    even = np.repeat([0, 1], 20)
+    assert not score_text.balanced_rows(summarise([told("mvitac", 0, even, even)])["t"], ["both"])
+
+
+def test_the_verdict_names_what_a_method_is_not_above() -> None:
+    def cell(low: float | None, high: float) -> dict:
+        return {"mean": high, "low": low, "high": high}
+
+    task = {
+        "both": {"mvitac": cell(0.5, 0.6), "imagenet": cell(0.7, 0.8), "untrained": cell(0.4, 0.55)},
+        "touch": {"mvitac": cell(0.5, 0.6), "imagenet": cell(0.1, 0.2)},
+        "none": {"majority": cell(0.2, 0.3)},
+    }
+    assert score_text.verdicts(task) == [
+        "mvitac by touch + vision: interval below imagenet and overlaps untrained",
+        "mvitac does not beat a frozen ImageNet trunk, by touch + vision",
+    ]
+    task["both"] = {"mvitac": cell(0.5, 0.6), "cmc": cell(None, 0.6), "imagenet": cell(0.1, 0.4)}
+    assert score_text.verdicts(task) == [
+        "mvitac by touch + vision: interval above every control",
+        "cmc by touch + vision: interval overlaps imagenet, majority",
+        "cmc does not beat a frozen ImageNet trunk, by touch + vision",
+    ]
+    assert score_text.verdicts({"touch": {"mvitac": cell(0.5, 0.6)}}) == []  # --no-controls
 
 
 # -- worked cases -----------------------------------------------------------------------------------------------------

@@ -11,18 +11,24 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import timm
+import torch
+from safetensors.torch import save_file
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation import sensors
+from mvitac.evaluation.controls import imagenet_trunk
 from mvitac.evaluation.diagnostics import mean_error
 from mvitac.evaluation.evaluate import check_unseen
+from mvitac.evaluation.leaks import UNKNOWN
 from mvitac.evaluation.probe import probe_model
 from mvitac.experiments.adapt import COLOURED, NEW, OLD, TRANSFER, Adaptation, _old_packs, _scores, adapt
-from mvitac.experiments.finetune import FROZEN, SCRATCH, Finetuning, finetune
+from mvitac.experiments.finetune import FROZEN, SCRATCH, Finetuning, _start, finetune
 from mvitac.model_files import load
+from mvitac.nn.encoders import EncoderConfig
 from mvitac.report.tables import print_finetuning
 from mvitac.run import load_run
 from mvitac.system.files import read_json
@@ -101,6 +107,32 @@ def test_a_loss_against_the_frozen_probe_is_said_with_what_to_do(lost: bool) -> 
     result = {"data": "d", "group_by": "object", "ancestor": "runs/a", "records": records, "notes": [], "leaks": []}
     print_finetuning(result, file := io.StringIO())
     assert ("use the frozen probe of runs/a instead, with `mvitac publish --on PACK`" in file.getvalue()) == lost
+
+
+def test_a_trunk_of_others_is_a_start_too(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its weights are those of the frozen probe and the start, not those of the control; the forecast comes first."""
+    trunk = timm.create_model("mvitac_tiny", num_classes=0)
+    save_file(trunk.state_dict(), tmp_path / "w.safetensors")
+    start, said = Path(f"mvitac_tiny={tmp_path / 'w.safetensors'}"), []
+    model, init = _start(start, PackConfig(path=pack.path), pack)
+    assert all(
+        torch.equal(encoder.state_dict()[k], v)
+        for encoder in model.encoders.values()
+        for k, v in trunk.state_dict().items()
+    )
+    assert not init and model.sides("touch") == (32, 32)
+    result = tune(start, pack, tmp_path / "out", replace(ASKED, lr=(1e-3,), steps=(4,)), say=said.append)
+    assert said[0] == "at most 2 trainings, 8 steps of 16" and said[1].startswith("100 %: fine-tuned")
+    assert re.fullmatch(r"about \d+ s for all of them, by the first \d steps", said[2])
+    assert {r["source"] for r in result["records"]} == {"fine-tuned, all", SCRATCH, FROZEN}
+    assert {r["leak"] for r in result["records"] if r["source"] == SCRATCH} == {""}
+    assert {r["leak"] for r in result["records"] if r["source"] != SCRATCH} == {UNKNOWN}
+    assert load_run(tmp_path / "out" / "seed0")[0].encoder.touch.weights.endswith("w.safetensors")
+    monkeypatch.setattr("mvitac.experiments.finetune.fresh", lambda run, *_: run.encoder.touch)
+    config, _ = _start(Path("imagenet:resnet18"), PackConfig(path=pack.path), pack)
+    assert (config.trunk, config.weights) == ("resnet18", "imagenet")  # type: ignore[attr-defined]
+    config, _ = _start(Path("imagenet"), PackConfig(path=pack.path), pack)
+    assert config == imagenet_trunk(EncoderConfig())
 
 
 def tried_in(folder: Path) -> dict[str, float]:

@@ -29,7 +29,7 @@ from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.deploy.publish import publish
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs, stored_result
 from mvitac.evaluation.intervals import interval
-from mvitac.evaluation.score_text import cell_text, columns_of
+from mvitac.evaluation.score_text import cell_text, columns_of, verdicts
 from mvitac.evaluation.scores import summarise
 from mvitac.experiments.plan import Plan, Row
 from mvitac.experiments.table import lines_of
@@ -170,6 +170,8 @@ def test_verdict_and_figures_carry_the_numbers(materials: Path, result: dict[str
     drawn = {path.name for path in (materials / "out" / "figures").iterdir()}
     assert {"probe-category.png", "loss.png", "confusion-soft.png", "map-touch.png", "retrieval.png"} <= drawn
     assert len(page.images("svg+xml")) == len(drawn)
+    assert "Every class of category, by touch + vision" in page.text
+    assert verdicts(result["summary"]["category"])[0].partition(": ")[2] in page.text.replace("\xa0", " ")
     for curve in ("parts of the loss", "effective rank", "kNN accuracy, rough", "modality gap", "retrieval R@5"):
         assert curve in page.text
 

@@ -204,7 +204,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(pack: Pack, straight: Path, tmp_path
     """In a process of its own: libraries of other tests may leave one in which no signal can be handled."""
     process = begin(stopped_at_four, pack.path, tmp_path / "r", output=tmp_path / "said")
     finish(process, tmp_path / "said")
-    assert "after step 4 of 8; continue with --resume" in (tmp_path / "said").read_text()
+    assert f"after step 4 of 8; {tmp_path / 'r'} continues with resume" in (tmp_path / "said").read_text()
     assert torch.load(tmp_path / "r" / "checkpoint.pt", weights_only=True)["step"] == 4
     train(smoke(pack), tmp_path / "r", resume=True, quiet=True)
     assert_equal_weights(straight, tmp_path / "r")

@@ -19,7 +19,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.table.splits import folds
-from mvitac.evaluation.probe import Probe
+from mvitac.evaluation.probe_config import Probe
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.system.files import brief, digest
 

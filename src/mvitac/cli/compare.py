@@ -7,16 +7,16 @@ from typing import Any
 import torch
 
 from mvitac.cli.options import parse, selectors
-from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.base import DatasetConfig, dataset
 from mvitac.evaluation.evaluate import ProbeConfig
-from mvitac.evaluation.probe import Probe
+from mvitac.evaluation.probe_config import Probe
 from mvitac.experiments.collect import outline
 from mvitac.experiments.cross_validation import gather_folds, lay_out_folds, together
 from mvitac.experiments.jobs import do_all
 from mvitac.experiments.plan import PLANS, Plan, find_plan, setting
 from mvitac.experiments.table_formats import write_tables
 from mvitac.recipes import RECIPES
-from mvitac.registry import default, to_json, unknown
+from mvitac.registry import to_json, unknown
 from mvitac.system.device import pick_device
 from mvitac.system.files import check_place, write_json
 
@@ -104,8 +104,8 @@ def _parse(chosen: dict[str, str], rest: list[str], plan: Plan) -> _Options:
     """The options, with the plan's own values as defaults."""
     if chosen.get("--recipe", plan.recipe) not in RECIPES:
         raise unknown("recipe", chosen.get("--recipe", plan.recipe), RECIPES)
-    data = default(DatasetConfig, chosen["--data"]) if "--data" in chosen else plan.data
-    data = data or default(DatasetConfig, "grasps" if plan.name == "table2" else "materials")
+    data = dataset(chosen["--data"]) if "--data" in chosen else plan.data
+    data = data or dataset("grasps" if plan.name == "table2" else "materials")
     same: Any = {name: getattr(plan, name) for name in _SAME}
     usual = _Options(data=data, out=Path("runs") / f"compare-{plan.name}-{data.name}", **same)
     choices = {"plans": PLANS, "data": DatasetConfig.choices, "recipes": RECIPES}

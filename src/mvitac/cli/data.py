@@ -15,7 +15,7 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
 from mvitac.data.spec import Task, Window, listed
-from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.base import DatasetConfig, dataset
 from mvitac.datasets.mix import open_packs
 from mvitac.datasets.simulated import SimulatedConfig
 from mvitac.registry import default, unknown
@@ -56,7 +56,7 @@ def pack(argv: list[str]) -> None:
             print(f"usage: {usage}\n\nThe options of one: mvitac data pack --data NAME --help")
             return
         raise ValueError(f"name the dataset: {usage}")
-    _build(default(DatasetConfig, chosen["--data"]), short(rest), f"data pack --data {chosen['--data']}")
+    _build(dataset(chosen["--data"]), short(rest), f"data pack --data {chosen['--data']}")
 
 
 def _build(config: Any, argv: list[str], prog: str) -> None:

@@ -13,11 +13,10 @@ from mvitac.cli.options import check_json, parse, printed_to, save_json, selecto
 from mvitac.data.checks.examine import Draw, examine_open, examine_pack, examine_source, nothing
 from mvitac.data.checks.finding import Finding, exit_code
 from mvitac.data.pack import Pack
-from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.base import DatasetConfig, dataset
 from mvitac.datasets.mix import open_packs
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.table.table import RowsConfig
-from mvitac.registry import default
 from mvitac.report.contact_sheet import draw, suspicious
 from mvitac.system.files import check_place, write_atomic
 
@@ -68,11 +67,13 @@ def check(argv: list[str]) -> int:
             return _report(name, examine_pack(name, draw=draw_sheet), options)
         return _report(name, examine_open(open_packs(options.pack), draw=draw_sheet), options)
     name = f"--data {chosen['--data']}"
-    if chosen["--data"] == PackConfig.name:
-        options = parse(_WindowOptions, short(rest), f"data check {name}", description=_MANUAL)
+    opened = dataset(chosen["--data"])
+    if isinstance(opened, PackConfig):
+        usual = _WindowOptions(data=opened)
+        options = parse(_WindowOptions, short(rest), f"data check {name}", default=usual, description=_MANUAL)
         found = examine_pack(options.data.path, options.data.frame_window(), _sheet(name, options))
         return _report(str(options.data.path), found, options)
-    usual = _SourceOptions(data=default(DatasetConfig, chosen["--data"]))
+    usual = _SourceOptions(data=opened)
     options = parse(_SourceOptions, short(rest), f"data check {name}", default=usual, description=_MANUAL)
     draw_sheet = _sheet(name, options)
     if options.items < 0:

@@ -7,15 +7,9 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import Positional
 
-from mvitac.cli.options import parse
+from mvitac.cli.options import check_models, loading, parse
 from mvitac.data.pack import Pack
-from mvitac.deploy import export as exports
-from mvitac.deploy.artifact import ARTIFACT, load
-from mvitac.deploy.publish import own_data, with_probes
-from mvitac.deploy.publish import publish as write_artifact
-from mvitac.deploy.publish import push as push_artifact
-from mvitac.evaluation.evaluate import as_trained
-from mvitac.report.tables import print_summary, text_table
+from mvitac.deploy.export_config import ExportConfig
 from mvitac.system.progress import shown
 
 
@@ -40,17 +34,23 @@ class _PublishOptions:
 def publish(argv: list[str]) -> None:
     """mvitac publish RUN OUT [--on PACK] [--push OWNER/NAME]"""
     options = parse(_PublishOptions, argv, "publish")
+    check_models(options.run)
+    loading()
+    from mvitac.deploy import publish
+    from mvitac.deploy.artifact import ARTIFACT
+    from mvitac.report.tables import print_summary
+
     with shown():
         pack = Pack(options.on) if options.on else None
-        out = write_artifact(options.run, options.out, pack, allow_leak=options.allow_leak)
+        out = publish.publish(options.run, options.out, pack, allow_leak=options.allow_leak)
     print_summary(ARTIFACT.read(out)["scores"])
     print(f"written: {out}")
     if options.push:
-        print(f"pushed: {push_artifact(out, options.push, private=options.private)}")
+        print(f"pushed: {publish.push(out, options.push, private=options.private)}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class _ExportOptions(exports.ExportConfig):
+class _ExportOptions(ExportConfig):
     """Write a model as ONNX, for OpenVINO and ONNX Runtime: uint8 in, embeddings, probabilities and values out. The result
     is compared with the model on real inputs; nothing is written if it differs."""
 
@@ -73,18 +73,26 @@ class _ExportOptions(exports.ExportConfig):
 def export(argv: list[str]) -> None:
     """mvitac export RUN|ARTIFACT --out DIR [--precision fp32|bf16|int8]"""
     options = parse(_ExportOptions, argv, "export")
+    check_models(options.model)
+    loading()
+    from mvitac.deploy.artifact import load
+    from mvitac.deploy.export import export
+    from mvitac.deploy.publish import own_data, with_probes
+    from mvitac.evaluation.evaluate import as_trained
+    from mvitac.report.tables import text_table
+
     model = load(options.model)
     pack = Pack(options.on) if options.on else own_data(model, "check the export on a pack, --on PACK")
     pack = as_trained(model, pack)
     with shown():
         calibrate = as_trained(model, Pack(options.calibrate)) if options.calibrate else None
         new = Pack(options.new_sensor) if options.new_sensor else None
-        report = exports.export(with_probes(model, pack), pack, options.out, options, calibrate=calibrate, new=new)
-    print(_table(options.out, report, new.path if new else None))
+        report = export(with_probes(model, pack), pack, options.out, options, calibrate=calibrate, new=new)
+    title = f"{options.out}: checked on {report['num_rows']} {f'rows of {new.path}' if new else 'test rows'}"
+    print(text_table(title, ["", "original", "export"], _rows(report)))
 
 
-def _table(out: Path, report: dict[str, Any], new: Path | None) -> str:
-    title = f"{out}: checked on {report['num_rows']} {f'rows of {new}' if new else 'test rows'}"
+def _rows(report: dict[str, Any]) -> list[list[str]]:
     rows = []
     for task, values in report["accuracy"].items():
         rows.append([f"{task}, accuracy %", f"{values['original']:.1f}", f"{values['export']:.1f}"])
@@ -97,4 +105,4 @@ def _table(out: Path, report: dict[str, Any], new: Path | None) -> str:
         rows.append([f"{name}, lowest cosine", "", f"{values['min']:.5f}"])
     rows.append(["size, MB", "", f"{report['size_mb']}"])
     rows.append(["latency of one pair, ms: p50 / p99", "", "{p50} / {p99}".format(**report["latency_ms"])])
-    return text_table(title, ["", "original", "export"], rows)
+    return rows

@@ -7,15 +7,10 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional
 
-from mvitac.cli.options import check_json, parse, printed_to, save_json
+from mvitac.cli.options import check_json, check_models, loading, parse, printed_to, save_json
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
-from mvitac.evaluation.encoders import about_lines
-from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
-from mvitac.evaluation.scores import summarise_again
-from mvitac.evaluation.sensors import RecolouredPack
-from mvitac.report.report import write_report
-from mvitac.report.tables import print_retrieval, print_summary
+from mvitac.evaluation.probe_config import ProbeConfig
 from mvitac.system.files import read_json
 from mvitac.system.progress import shown
 
@@ -37,6 +32,8 @@ class _ProbeOptions:
     without labels."""
     allow_leak: bool = False
     """Score a run also on rows or groups of --on that it was trained on. LEAK stands beside every such score."""
+    per_class: bool = False
+    """Also print precision, recall, rows and groups of each class."""
     weights: Literal["last", "best"] = "last"
     """Weights after the last step, or the best on split val, which training keeps with --eval-every."""
     json: Path | None = None
@@ -47,10 +44,20 @@ def probe(argv: list[str]) -> None:
     """mvitac probe RUN... [--encoder external:...] [--on PACK] [--learn-on PACK] [--json FILE]"""
     options = parse(_ProbeOptions, argv, "probe")
     check_json(options.json)
+    check_models(*options.runs)
+    loading()
+    from mvitac.evaluation.encoders import about_lines
+    from mvitac.evaluation.evaluate import probe_runs
+    from mvitac.evaluation.scores import summarise_again
+    from mvitac.evaluation.sensors import RecolouredPack
+    from mvitac.report.tables import print_classes, print_retrieval, print_summary
+
     pack = Pack(options.on) if options.on else None
     if options.learn_on:
         if not pack:
             raise ValueError("--learn-on fits the probes: name the pack on which they are scored, --on PACK")
+        if options.config.folds:
+            raise ValueError("--folds fits and scores on one pack: leave --learn-on out")
         join = RecolouredPack if "colours" in options.config.standardise else JoinedPack
         pack = join(Pack(options.learn_on), pack)
     elif "colours" in options.config.standardise:
@@ -62,6 +69,8 @@ def probe(argv: list[str]) -> None:
     print_summary(result, say, probe=options.config.probes[0])
     for kind in options.config.kinds[1:]:
         print_summary({**result, "summary": summarise_again(result["records"], kind)}, say, probe=kind)
+    if options.per_class:
+        print_classes(result, say)
     for line in about_lines(result["encoders"]):
         print(f"encoder: {line}", file=say)
     print_retrieval(result, say)
@@ -88,6 +97,10 @@ class _ReportOptions:
 def report(argv: list[str]) -> None:
     """mvitac report RUN... [--out DIR] [--probe FILE.json]"""
     options = parse(_ReportOptions, argv, "report")
+    check_models(*options.runs)
     result = read_json(options.probe, "a probe result") if options.probe else None
+    loading()
+    from mvitac.report.report import write_report
+
     out = options.out or (options.runs[0] / "report" if len(options.runs) == 1 else Path("runs") / "report")
     print(f"written: {write_report(options.runs, out, result=result, quiet=options.quiet)}")

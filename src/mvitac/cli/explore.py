@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from mvitac.cli.options import parse
+from mvitac.cli.options import check_models, loading, parse
 from mvitac.data.pack import Pack
 from mvitac.system.progress import shown, work
 
@@ -36,6 +36,8 @@ def explore(argv: list[str]) -> None:
     options = parse(_Options, argv, "explore")
     if not 1 <= len(options.runs) <= 2:
         raise ValueError(f"{len(options.runs)} runs given: give one, or two to compare")
+    check_models(*options.runs)
+    loading()
     try:
         from mvitac.report.explorer import serve
 

@@ -8,12 +8,11 @@ import tyro
 from tyro.conf import Positional
 
 from mvitac.cli.options import asks_help, parse, selectors
-from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.base import DatasetConfig, dataset
 from mvitac.experiments.adapt import Adaptation
 from mvitac.experiments.adapt import adapt as run_adapt
 from mvitac.experiments.finetune import Finetuning
 from mvitac.experiments.finetune import finetune as run_finetune
-from mvitac.registry import default
 from mvitac.report.tables import print_adaptation, print_finetuning
 
 
@@ -32,6 +31,9 @@ class _Options:
 
 @dataclass(frozen=True, kw_only=True)
 class _FinetuneOptions(_Options):
+    model: Positional[Path]
+    """Folder of a finished run, or of an artifact; imagenet, or imagenet:TRUNK; or TRUNK=FILE, other weights of a trunk of
+    timm."""
     config: Annotated[Finetuning, tyro.conf.arg(name="")] = Finetuning()
 
 
@@ -46,11 +48,11 @@ def _run(kind: type[Any], work: Any, show: Any, argv: list[str], name: str, abou
     names = "|".join(DatasetConfig.choices)
     if "--data" not in chosen and not asks_help(rest):
         raise ValueError(f"name the data: --data {names}")
-    data = default(DatasetConfig, chosen.get("--data", "pack"))
+    data = dataset(chosen.get("--data", "pack"))
     usual = kind(model=Path("MODEL"), data=data, out=Path("runs") / f"{name.removesuffix('e')}ed")
-    options = parse(kind, rest, name, default=usual, description=f"{about}\n\n  --data {names}  (required)")
+    options = parse(kind, rest, name, default=usual, description=f"{about}\n\n  --data {names}  (required; or a path)")
     if options.model == usual.model:
-        raise ValueError(f"name the model: the folder of a run or an artifact (see mvitac {name} --help)")
+        raise ValueError(f"name the model: the folder of a run or an artifact, or imagenet (see mvitac {name} --help)")
     more = {"resume": options.resume, "quiet": options.quiet, "say": print}
     result = work(options.model, options.data, options.config, options.out, **more)
     show(result)

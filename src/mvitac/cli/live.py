@@ -16,7 +16,7 @@ import tyro
 from pyarrow.csv import CSVWriter
 from tyro.conf import Positional
 
-from mvitac.cli.options import check_json, parse
+from mvitac.cli.options import check_json, check_models, loading, parse
 from mvitac.data.images import decode
 from mvitac.data.pack import Pack
 from mvitac.deploy.engine import EXPORT, Engine, about_sensor, frame_shapes
@@ -237,6 +237,8 @@ def _engine(model: str, threads: int, modalities: tuple[Any, ...] = ()) -> Engin
     """The engine of an export; a run or an artifact is exported first, once, into the cache, with these inputs."""
     if (Path(model) / EXPORT.name).is_file():
         return Engine(model, threads=threads)
+    check_models(model)
+    loading()
     from mvitac.deploy.artifact import load
     from mvitac.deploy.export import ExportConfig, export
     from mvitac.deploy.publish import own_data, with_probes

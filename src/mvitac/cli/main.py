@@ -5,6 +5,8 @@ A mistake of the user ends in one line on stderr and exit code 2, Ctrl-C in 130.
 
 import importlib
 import os
+import re
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,6 +43,10 @@ COMMANDS = {
 """Command -> module of this package:function, imported when called."""
 
 
+HEAVY = ("demo", "pretrain", "finetune", "adapt", "compare", "bench")
+"""Commands whose options need torch. The others import it once their options are known to be right."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     if "OMP_WAIT_POLICY" not in os.environ:
@@ -50,6 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return _run(arguments)
     except KeyboardInterrupt:
+        print(f"mvitac: stopped{_continued(arguments)}", file=sys.stderr)
         return 130
     except (ValueError, OSError, MemoryError) as error:
         text = " ".join(str(error).split()) or type(error).__name__
@@ -60,8 +67,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:
         if type(error).__name__ != "Interrupted":  # training.loop's, which is not imported for every command
             raise
-        print(f"mvitac: {error}", file=sys.stderr)
+        print(f"mvitac: {str(error).partition(';')[0]}{_continued(arguments)}", file=sys.stderr)
         return 130
+
+
+def _continued(arguments: list[str]) -> str:
+    """The command that goes on where the one of ``arguments`` was stopped; "" if nothing of it is kept."""
+    if arguments[0] not in HEAVY:
+        return ""
+    resume = "--resume" in help_file(arguments[0]).read_text() and "--resume" not in arguments
+    return f"; continue: {shlex.join(['mvitac', *arguments, *['--resume'] * resume])}"
 
 
 def _run(arguments: list[str]) -> int:
@@ -89,8 +104,28 @@ def _run(arguments: list[str]) -> int:
     if rest in (["--help"], ["-h"]) and text.exists():
         print(text.read_text(encoding="utf-8"), end="")
         return 0
+    if not {"-h", "--help"} & set(rest):
+        _check_choices(rest, text)
+        if name in HEAVY:
+            from mvitac.cli.options import loading
+
+            loading()
     module, function = COMMANDS[name].split(":")
     return getattr(importlib.import_module(f"mvitac.cli.{module}"), function)(with_names(rest)) or 0
+
+
+def _check_choices(rest: Sequence[str], text: Path) -> None:
+    """ValueError for a choice (--recipe NAME) that the stored help does not list, before torch is imported."""
+    for line in text.read_text().splitlines() if text.exists() else ():
+        known = re.match(r" *(--\w+) ([\w.-]+(?:\|[\w.-]+)+) ", line)
+        if not known or known[1] not in rest:
+            continue
+        option, choices = known[1], known[2].split("|")
+        value = next(iter(rest[rest.index(option) + 1 :]), choices[0])
+        if value not in choices and not Path(value).exists():
+            from mvitac.registry import unknown
+
+            raise unknown({"--data": "dataset"}.get(option, option[2:]), value, choices)
 
 
 def help_file(command: str) -> Path:

@@ -113,6 +113,19 @@ def selectors(argv: list[str], names: Sequence[str]) -> tuple[dict[str, str], li
     return {name: value for name, value in vars(found).items() if value is not None}, rest
 
 
+def loading() -> None:
+    """Say at once that work has begun, before torch is imported, which takes seconds."""
+    if "torch" not in sys.modules and sys.stderr.isatty():
+        print("mvitac: loading PyTorch ...", file=sys.stderr, flush=True)
+
+
+def check_models(*models: str | Path) -> None:
+    """ValueError for the first of ``models`` that is not here and no name on the Hub or of an encoder (external:...)."""
+    for model in models:
+        if ":" not in str(model) and not Path(model).exists() and Path(model).parent.is_dir():
+            raise ValueError(f"no trained model at {model}")
+
+
 def asks_help(argv: Sequence[str]) -> bool:
     return bool({"-h", "--help"} & set(argv))
 

@@ -7,10 +7,9 @@ from typing import Annotated
 import tyro
 
 from mvitac.cli.options import asks_help, parse, selectors
-from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.base import DatasetConfig, dataset
 from mvitac.methods.base import MethodConfig
 from mvitac.recipes import RECIPES, recipe, with_method
-from mvitac.registry import default
 from mvitac.run import Run, read_record
 from mvitac.system.distributed import join
 from mvitac.training.log import LOGGERS, open_loggers
@@ -42,7 +41,7 @@ def pretrain(argv: list[str]) -> None:
 
     First choose, then change single fields below (defaults are those of the chosen recipe):
       --recipe {"|".join(RECIPES)}  (default quick)
-      --data {"|".join(DatasetConfig.choices)}  (required)
+      --data {"|".join(DatasetConfig.choices)}  (required; or the path of a pack, a table or a folder)
       --method {"|".join(MethodConfig.choices)}  (default mvitac)
       --from RUN.JSON   repeat a recorded run instead
       --init RUN        start from its weights (also an artifact, or a .safetensors file)
@@ -69,6 +68,6 @@ def _chosen_run(chosen: dict[str, str], phased: bool) -> Run:
             if name in chosen:
                 raise ValueError(f"--from already decides {name}: leave it out, or change single fields")
         return read_record(Path(chosen["--from"]))[0]
-    data = default(DatasetConfig, chosen.get("--data", "materials"))
+    data = dataset(chosen.get("--data", "materials"))
     base = recipe(chosen.get("--recipe", "quick"), data, phased if data.phased is None else data.phased)
     return with_method(base, chosen.get("--method", base.method.name))

@@ -14,7 +14,7 @@ from PIL import Image
 from tabulate import tabulate
 from tyro.conf import Positional
 
-from mvitac.cli.options import check_json, parse, printed_to, save_json
+from mvitac.cli.options import check_json, check_models, loading, parse, printed_to, save_json
 from mvitac.data.images import decode, fit
 from mvitac.data.pack import Pack
 from mvitac.system.files import check_place, write_atomic
@@ -40,6 +40,8 @@ class _EmbedOptions:
 def embed(argv: list[str]) -> None:
     """mvitac embed PACK --model M --out FILE.parquet [--shared]"""
     options = parse(_EmbedOptions, argv, "embed")
+    check_models(options.model)
+    loading()
     from mvitac.deploy.artifact import load
     from mvitac.deploy.search import embed
     from mvitac.evaluation.evaluate import as_trained
@@ -85,6 +87,8 @@ class _FindOptions:
 def find(argv: list[str]) -> None:
     """mvitac find IMAGE --model M --known FILE.parquet [--from touch] [--to vision] [--json FILE]"""
     options = parse(_FindOptions, argv, "find")
+    check_models(options.model)
+    loading()
     from mvitac.deploy.artifact import load
     from mvitac.deploy.search import Embeddings
 

@@ -1,6 +1,6 @@
 """The base class of dataset configs. A config gives a source of samples; all other code reads the pack made from it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -9,7 +9,7 @@ from tyro.conf import Fixed
 from mvitac.data.pack import Pack
 from mvitac.data.spec import QUALITY, Store, Window, check_request, stored_as
 from mvitac.data.windows import windowed
-from mvitac.registry import Registered
+from mvitac.registry import Registered, default
 from mvitac.system.files import cache_dir, check_place, digest
 
 if TYPE_CHECKING:
@@ -57,6 +57,11 @@ class DatasetConfig(Registered):
     def __post_init__(self) -> None:
         self.frame_window()
         check_request(self.store, size=self.size, workers=self.workers, quality=self.quality)
+
+    @classmethod
+    def reads(cls, path: Path) -> bool:
+        """Whether ``path``, which exists, is this dataset's and no other's."""
+        return False
 
     def frame_window(self) -> Window:
         """The frames that a row shows."""
@@ -110,3 +115,14 @@ class DatasetConfig(Registered):
         from mvitac.data.build import build  # what is packed already needs no builder
 
         return build(source, path, quiet=quiet, exist_ok=True, **self.build_options())
+
+
+def dataset(text: str) -> DatasetConfig:
+    """The dataset of this name; or the pack, the table, the videos or the folder at this path. ValueError if it is neither.
+
+    A path is ``--data folder``'s where no other dataset ``reads`` it.
+    """
+    if text in DatasetConfig.choices or not Path(text).exists():
+        return default(DatasetConfig, text)
+    name = next((name for name, kind in DatasetConfig.choices.items() if kind.reads(Path(text))), "folder")
+    return replace(default(DatasetConfig, name), path=Path(text))  # type: ignore[call-arg]

@@ -24,6 +24,10 @@ class PackConfig(DatasetConfig):
     """val: use split val as the test split and hide test, to choose a recipe by `mvitac compare` without its test
     scores."""
 
+    @classmethod
+    def reads(cls, path: Path) -> bool:
+        return (path / "pack.json").is_file()
+
     def _frames(self, quiet: bool) -> Pack:
         pack = Pack(self.path)
         if self.score_on == "val":

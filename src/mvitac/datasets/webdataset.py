@@ -32,6 +32,10 @@ class WebDatasetConfig(RowsConfig):
     pictures: Literal["touch", "vision"] = "touch"
     """Modality of images without a name of their own (0001.jpg, not 0001.touch.jpg)."""
 
+    @classmethod
+    def reads(cls, path: Path) -> bool:
+        return path.suffix == ".tar"
+
     def manifest(self) -> Manifest:
         shards = sorted(self.path.glob("*.tar")) if self.path.is_dir() else [self.path]
         if not shards or not shards[0].is_file():

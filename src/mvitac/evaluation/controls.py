@@ -22,8 +22,8 @@ from mvitac.evaluation.probe import (
     score_rows,
     split_rows,
 )
+from mvitac.evaluation.probe_config import Standardise
 from mvitac.evaluation.retrieval import cross_modal
-from mvitac.evaluation.sensors import Standardise
 from mvitac.methods.simclr import SimCLRConfig
 from mvitac.model import Model
 from mvitac.model_files import fresh

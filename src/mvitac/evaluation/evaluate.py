@@ -1,11 +1,11 @@
 """Evaluate finished runs: probe them and their controls together, in one result for tables and reports."""
 
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from functools import partial
 from html import escape
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from tabulate import tabulate
 
@@ -14,21 +14,22 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
-from mvitac.evaluation import few_labels
 from mvitac.evaluation.controls import Records, controls_of, frozen_trunks
-from mvitac.evaluation.encoders import open_encoders, probe_encoders
+from mvitac.evaluation.encoders import Bound, open_encoders, probe_encoders
+from mvitac.evaluation.folds import fold_splits, with_split
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
-from mvitac.evaluation.probe import PROBES, Probe, probe_model, probes_of, seen_by, split_rows
+from mvitac.evaluation.probe import PROBES, probe_model, probes_of, seen_by, split_rows
+from mvitac.evaluation.probe_config import ProbeConfig
 from mvitac.evaluation.retrieval import cross_modal, retrieved_rows
 from mvitac.evaluation.run_names import names_of
 from mvitac.evaluation.score_text import cell_text, columns_of, covered, score_name, sources_of, tested_on
-from mvitac.evaluation.scores import summarise
-from mvitac.evaluation.sensors import Standardise, about_new, describe_statistics
+from mvitac.evaluation.scores import per_class, pool, summarise
+from mvitac.evaluation.sensors import about_new, describe_statistics
 from mvitac.model import Model
 from mvitac.model_files import Which, load, weights_file
 from mvitac.nn.encoders import build_trunk
 from mvitac.registry import from_json, to_json, unknown
-from mvitac.run import load_run
+from mvitac.run import Run, load_run
 from mvitac.shipped import named
 from mvitac.system.files import check_place, digest_file, read_json, write_json
 from mvitac.system.progress import work
@@ -37,42 +38,6 @@ from mvitac.system.threads import in_threads
 Probed = tuple[Path, Model, str, list[Source] | None]  # a run: folder, model, name, and what it learned from
 END_TO_END = ", end to end"
 """Suffix of a source's name for the scores of its own heads, trained along with its encoders."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ProbeConfig:
-    """What to probe, and whether to score controls."""
-
-    probes: tuple[Probe, ...] = ("linear",)
-    """linear: logistic regression, or ridge for values, C or alpha chosen on held-out groups of train. paper: the paper's
-    Adam probe. knn: 20 nearest."""
-    tasks: tuple[str, ...] = ()
-    """Tasks to probe. Default: all."""
-    modalities: tuple[Literal["touch", "vision", "both"], ...] = ()
-    """Modalities to probe. Default: all of the data."""
-    controls: bool = True
-    """Score the controls, too: a frozen ImageNet trunk (where weights are installed or cached), the untrained trunk, pixels,
-    border, majority class, and the dataset's own. --no-controls leaves them out."""
-    fractions: tuple[float, ...] = ()
-    """Also fit the linear probe on these percentages of the labels, such as 1 10."""
-    standardise: tuple[Standardise, ...] = ()
-    """Statistics of each touch sensor (column sensor), from unlabelled images. features: standardise its features by
-    their own mean and standard deviation. colours: show images of a sensor that --learn-on lacks in the colours of those
-    that it has, and take the mean features."""
-
-    def __post_init__(self) -> None:
-        given = {"probe": self.probes, "task": self.tasks, "modality": self.modalities, "standardise": self.standardise}
-        for name, values in given.items():
-            for value in values:
-                if values.count(value) > 1:
-                    raise ValueError(f"{name} {value!r} is given twice: give it once")
-        if not all(0 < percent <= 100 for percent in self.fractions):
-            raise ValueError(f"fractions {self.fractions}: give percentages, above 0, at most 100")
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """``probes``, and the linear probes on ``fractions`` of the labels."""
-        return (*self.probes, *map(few_labels.name, self.fractions))
 
 
 class Scores(dict[str, Any]):
@@ -97,7 +62,7 @@ def probe(*runs: str | Path, on: str | Path | Pack | None = None, allow_leak: bo
         runs: Folders of runs: seeds of one method, or several methods, trained on one dataset.
         on: Another pack, or its folder, to probe on. Default: the data the runs were trained on.
         allow_leak: Score also test rows of ``on`` that a run was trained on.
-        options: Fields of ``ProbeConfig``: probes, tasks, modalities, controls, imagenet, fractions.
+        options: Fields of ``ProbeConfig``: probes, tasks, modalities, controls, fractions, folds.
 
     Returns:
         The scores, a dict (see ``probe_runs``).
@@ -124,13 +89,13 @@ def probe_runs(
 ) -> Scores:
     """Probe finished runs and their controls, and write the result to probe.json in the folder of each run, as ``probe``.
 
-    ``weights`` are those after the last step, or the best on split val, whose result is in probe.best.json. ``encoders``
-    are other people's to probe beside the runs ("external:..."); they need ``pack``.
+    ``weights`` are those after the last step, or the best on split val, whose result is in probe.best.json; that of folds
+    is in probe.folds.json. ``encoders`` are other people's to probe beside the runs ("external:..."); they need ``pack``.
 
     Returns:
         Scores, a dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary",
-        "asked" (the config), "models" (digests of the weights) and "encoders" (``ExternalModel.describe``). A record has
-        a "leak", which is empty unless its test rows, or their groups, were trained on.
+        "per_class", "asked" (the config), "models" (digests of the weights) and "encoders" (``ExternalModel.describe``).
+        A record has a "leak", which is empty unless its test rows, or their groups, were trained on.
 
     Raises:
         ValueError: If a path is no run, a run is given twice, the runs and the data do not fit together, or a run was
@@ -151,7 +116,7 @@ def probe_runs(
     for path, model in zip(paths, models, strict=True):
         check_place(path / "probe.json")
         check_channels(path, model, pack, pack.spec.modalities)
-    for task in tasks:  # has rows to fit and to score
+    for task in () if session.folds else tasks:  # has rows to fit and to score
         for modality in seen_by(pack, task, modalities):
             split_rows(pack, task, modality)
     # The initial weights that an artifact names may be any file or download.
@@ -159,28 +124,69 @@ def probe_runs(
     for _, run in frozen_trunks(runs) if session.controls else ():
         for config in {run.encoder.vision, run.encoder.touch}:
             build_trunk(config, 3)  # missing weights are found before any probe is fitted
-    sources = check_unseen(paths, pack, tasks, allow_leak=allow_leak)
-    each = [*zip(paths, models, names, sources, strict=True)]
-    records, retrieval = _probe_models(each, pack, tasks, modalities, session)
-    records += probe_encoders(others, tasks, modalities, session.kinds, controls=session.controls)
-    if session.controls:
-        specs = [m.spec for m in models]
-        found = controls_of(runs, pack, tasks, modalities, session.kinds, specs, session.standardise)
-        records, retrieval = records + found[0], retrieval + found[1]
+    sources = check_unseen(paths, pack, tasks, allow_leak=allow_leak or bool(session.folds))
+    score = partial(_score, [*zip(paths, models, names, sources, strict=True)], runs, modalities, session)
+    if session.folds:
+        records, retrieval = _in_folds(score, pack, others, tasks, session.folds, sources), []
+        tested = [f"{session.folds} folds: every {pack.spec.group_by} that no run learned from is tested once"]
+    else:
+        (records, retrieval), tested = score(pack, others, tasks), []
+    classes = {task.name: list(task.classes) for task in tasks if isinstance(task, Task)}
     result = {
-        **{"data": pack.spec.name, "pack": pack.digest, "group_by": pack.spec.group_by, "notes": list(pack.spec.notes)},
-        "classes": {task.name: list(task.classes) for task in tasks if isinstance(task, Task)},
+        **{"data": pack.spec.name, "pack": pack.digest, "group_by": pack.spec.group_by},
+        **{"notes": [*pack.spec.notes, *tested], "classes": classes},
         "targets": {task.name: to_json(task.targets) for task in tasks if isinstance(task, ValueTask)},
         **{"asked": to_json(session), "models": _digests(paths, weights)},
         **{"encoders": [m.describe() for m, _ in others], "leaks": leaks_of([*records, *retrieval])},
         **{"records": records, "retrieval": retrieval, "summary": summarise(records, session.probes[0])},
+        "per_class": per_class(records, classes, session.probes[0]),
     }
     new = dict.fromkeys(about_new(model, pack, session.standardise) for model in models)
     if said := [*filter(None, new), *describe_statistics(pack, session.standardise)]:
         result["statistics"] = said
     for path in paths:
-        write_json(path / ("probe.best.json" if weights == "best" else "probe.json"), result, sealed=True)
+        name = "probe" + ".best" * (weights == "best") + ".folds" * bool(session.folds)
+        write_json(path / f"{name}.json", result, sealed=True)
     return Scores(result)
+
+
+def _score(
+    each: Sequence[Probed],
+    runs: Sequence[Run],
+    modalities: Sequence[str],
+    session: ProbeConfig,
+    pack: Pack,
+    others: Sequence[Bound],
+    tasks: Sequence[AnyTask],
+) -> tuple[Records, Records]:
+    """Probe and retrieval records of the runs, of other people's encoders, and of the controls."""
+    records, retrieval = _probe_models(each, pack, tasks, modalities, session)
+    records += probe_encoders(others, tasks, modalities, session.kinds, controls=session.controls)
+    if not session.controls:
+        return records, retrieval
+    specs = [model.spec for _, model, _, _ in each]
+    found, ranked = controls_of(runs, pack, tasks, modalities, session.kinds, specs, session.standardise)
+    return records + found, retrieval + ranked
+
+
+def _in_folds(
+    score: Callable[[Pack, Sequence[Bound], Sequence[AnyTask]], tuple[Records, Records]],
+    pack: Pack,
+    others: Sequence[Bound],
+    tasks: Sequence[AnyTask],
+    num: int,
+    sources: Sequence[list[Source] | None],
+) -> Records:
+    """Probe records of all folds, pooled. There is no retrieval: a fold has too few groups to search in."""
+    learned = [source for several in sources for source in several or ()]
+    splits = [(task, fold_splits(pack, task, num, learned)) for task in tasks]
+    folds: list[Records] = []
+    for k in range(num):
+        folds.append([])
+        for task, split in splits:
+            own = [(model, with_split(data, task, split[k])) for model, data in others]
+            folds[k] += score(with_split(pack, task, split[k]), own, [task])[0]
+    return pool(folds)
 
 
 def as_trained(model: Model, pack: Pack) -> Pack:

@@ -5,7 +5,7 @@ Nothing is chosen on test rows: regularisation is chosen on held-out groups of t
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,9 +15,10 @@ from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.evaluation.classifiers import Classifier, Constant, fit_knn, fit_linear, fit_papers
 from mvitac.evaluation.features import features
 from mvitac.evaluation.few_labels import few, percent_of
+from mvitac.evaluation.probe_config import Standardise
 from mvitac.evaluation.regressors import Linear, fit_curve, fit_neighbours, fit_ridge
 from mvitac.evaluation.scores import score
-from mvitac.evaluation.sensors import Standardise, touch_features
+from mvitac.evaluation.sensors import touch_features
 from mvitac.evaluation.value_scores import score_values
 from mvitac.model import Model
 from mvitac.registry import unknown
@@ -25,7 +26,6 @@ from mvitac.system.progress import tick
 
 PROBES = ("linear", "paper", "knn")
 """linear: logistic regression, C chosen on validation groups. paper: dropout .2, Adam 1e-4, 60 epochs. knn: 20 nearest."""
-Probe = Literal["linear", "paper", "knn"]
 VALUE_PROBES = ("linear", "knn")
 """Probes of tasks with values: ridge regression, alpha chosen on validation groups, and the mean of the 20 nearest."""
 

@@ -10,6 +10,8 @@ from typing import Any
 from mvitac.evaluation.leaks import leak_mark
 
 MODALITY_ORDER = ("none", "touch", "vision", "both")
+WORDS = {"touch": "touch", "vision": "vision", "both": "touch + vision"}  # the input of a probe, in words
+SHARED = ("imagenet", "start", "untrained", "pixels", "border")  # controls that see images
 
 
 def percent(value: float) -> str:
@@ -80,11 +82,72 @@ def columns_of(task: dict[str, Any]) -> list[str]:
 
 def sources_of(task: dict[str, Any]) -> list[str]:
     """Methods in order of appearance, then controls from the strongest idea to the weakest."""
-    last = ("imagenet", "start", "untrained", "pixels", "border")
-    found = list(dict.fromkeys(source for modality in task.values() for source in modality))
-    fixed = list(task.get("none", {}))
-    own = [s for s in found if s not in last and s not in fixed]
-    return [*own, *(s for s in last if s in found), *sorted(fixed, key=lambda s: s in ("majority", "mean"))]
+    found = dict.fromkeys(source for modality in task.values() for source in modality)
+    fixed = sorted(task.get("none", {}), key=lambda s: s in ("majority", "mean"))
+    return [*methods_of(task), *(s for s in SHARED if s in found), *fixed]
+
+
+def methods_of(task: dict[str, Any]) -> list[str]:
+    """The sources of one task's summary that are no controls, in order of appearance."""
+    found = dict.fromkeys(source for modality in task.values() for source in modality)
+    return [source for source in found if source not in SHARED and source not in task.get("none", {})]
+
+
+def headline(task: dict[str, Any], source: str, methods: Sequence[str]) -> tuple[str, dict[str, Any], dict[str, Any]]:
+    """The modality to show of one task's summary (both, else the best of ``source``), its score, and the controls beside it.
+
+    ``methods``: sources that are no controls.
+    """
+    have = [m for m in columns_of(task) if source in task[m]]
+    modality = "both" if "both" in have else max(have, key=lambda m: task[m][source]["mean"])
+    return modality, task[modality][source], beside(task, modality, methods)
+
+
+def beside(task: dict[str, Any], modality: str, methods: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """The controls of one task's summary at ``modality``."""
+    found = {**task.get("none", {}), **task[modality]}
+    return {source: found[source] for source in sources_of(task) if source in found and source not in methods}
+
+
+def above(own: dict[str, Any], controls: dict[str, dict[str, Any]]) -> str:
+    """Which of ``controls`` the interval of a score is not above: "below a, overlaps b", or "above every control"."""
+    below = [name for name, cell in controls.items() if _low(cell) > own["high"]]
+    level = [name for name, cell in controls.items() if cell["high"] >= _low(own) and name not in below]
+    found = [f"{word} {', '.join(names)}" for word, names in (("below", below), ("overlaps", level)) if names]
+    return " and ".join(found) or "above every control"
+
+
+def _low(cell: dict[str, Any]) -> float:
+    """Lower end of an interval; R2 may have none."""
+    return -math.inf if cell["low"] is None else cell["low"]
+
+
+def verdicts(task: dict[str, Any]) -> list[str]:
+    """A sentence on each method of one task's summary: whether it is above every control, or not above which.
+
+    A second one says by which modalities it is not above the frozen ImageNet trunk.
+    """
+    said, methods = [], methods_of(task)
+    for source in methods:
+        modality, own, controls = headline(task, source, methods)
+        if not controls:
+            continue
+        said.append(f"{source} by {WORDS[modality]}: interval {above(own, controls)}")
+        cells = {WORDS[m]: (task[m][source], task[m].get("imagenet")) for m in columns_of(task) if source in task[m]}
+        level = [m for m, (mine, frozen) in cells.items() if frozen and _low(mine) <= frozen["high"]]
+        if level:
+            said.append(f"{source} does not beat a frozen ImageNet trunk, by {', '.join(level)}")
+    return said
+
+
+def balanced_rows(task: dict[str, Any], modalities: Sequence[str]) -> list[list[str]]:
+    """Rows of source and its balanced accuracy at each of ``modalities``, of one task's summary; none of even classes."""
+    rows = []
+    for source in sources_of(task):
+        cells = [task.get(m, {}).get(source) or task.get("none", {}).get(source, {}) for m in modalities]
+        if any("balanced" in cell for cell in cells):
+            rows.append([f"{source}, balanced", *(percent(c["balanced"]) if "balanced" in c else "" for c in cells)])
+    return rows
 
 
 def cell_text(task: dict[str, Any], source: str, modality: str) -> str:

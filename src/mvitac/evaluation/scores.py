@@ -18,7 +18,8 @@ from mvitac.evaluation.value_scores import one_target, pool_values
 def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_classes: int) -> dict[str, Any]:
     """Score class probabilities [N, K] against labels ``y`` [N]; ``groups`` [N] are group numbers, for intervals.
 
-    Returns accuracy, balanced accuracy, macro F1, AUROC (two classes only), the confusion matrix and counts per group.
+    Returns accuracy, balanced accuracy, macro F1, AUROC (two classes only), the confusion matrix, the number of groups
+    with rows of each class, and counts per group.
     """
     guess = probabilities.argmax(1)
     present = np.unique(y)
@@ -34,6 +35,7 @@ def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_clas
         "macro_f1": float(f1),
         "auroc": auroc,
         "confusion": confusion_matrix(y, guess, labels=range(num_classes)).tolist(),
+        "class_groups": [len(np.unique(groups[y == k])) for k in range(num_classes)],
         "num_test": len(y),
         "group_sizes": np.bincount(groups, minlength=num_groups).tolist(),
         "group_correct": np.bincount(groups, weights=guess == y, minlength=num_groups).astype(int).tolist(),
@@ -74,7 +76,7 @@ def _pool_classes(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return {
         **means,
         "accuracy": sum(correct) / sum(sizes),
-        "confusion": np.sum([part["confusion"] for part in parts], axis=0).tolist(),
+        **{key: np.sum([part[key] for part in parts], axis=0).tolist() for key in ("confusion", "class_groups")},
         "num_test": sum(part["num_test"] for part in parts),
         "group_sizes": sizes,
         "group_correct": correct,
@@ -115,8 +117,9 @@ def leaks_in(records: Sequence[dict[str, Any]]) -> str:
 def summarise(records: Sequence[dict[str, Any]], probe: str = "linear") -> dict[str, Any]:
     """Scores as task -> modality -> method or control -> mean, low, high, seeds, number of test groups (``by_cell``).
 
-    Of values, the score is R2, and "targets" has the scores of each target (``targets_of``). With one test group R2 has
-    no lower end: ``low`` is None. "clipped" is ``most_clipped`` of ridge regression.
+    Where test classes are uneven (``is_uneven``), "balanced" is the balanced accuracy. Of values, the score is R2, and
+    "targets" has the scores of each target (``targets_of``). With one test group R2 has no lower end: ``low`` is None.
+    "clipped" is ``most_clipped`` of ridge regression.
     """
     summary: dict[str, Any] = {}
     for (task, modality, source), found in by_cell(records, probe).items():
@@ -126,12 +129,43 @@ def summarise(records: Sequence[dict[str, Any]], probe: str = "linear") -> dict[
         cell["groups"] = num_groups_of(found[0])
         if "targets" in found[0]:
             cell["targets"] = targets_of(found)
+        if is_uneven(found[0]):
+            cell["balanced"] = float(np.mean([record["balanced_accuracy"] for record in found]))
         if clipped := most_clipped(found):
             cell["clipped"] = clipped
         if leaks := leaks_in(found):
             cell["leak"] = leaks
         summary.setdefault(task, {}).setdefault(modality, {})[source] = cell
     return summary
+
+
+def is_uneven(record: dict[str, Any]) -> bool:
+    """Whether the most frequent class of the test rows has more than 1.25 times its even share."""
+    if "confusion" not in record:
+        return False
+    rows = np.sum(record["confusion"], axis=1)
+    return bool(rows.max() > 1.25 * rows[rows > 0].mean())
+
+
+def per_class(records: Sequence[dict[str, Any]], classes: dict[str, Sequence[str]], probe: str) -> dict[str, Any]:
+    """Precision and recall of each class as task -> modality -> a list of ``classes``; over seeds, from the summed counts.
+
+    Each has its name, "rows" and "groups" of test, and "scores": source -> [precision, recall]. Precision is None where a
+    source never says the class, recall where no test row has it.
+    """
+    found: dict[str, Any] = {}
+    for (task, modality, source), each in by_cell(records, probe).items():
+        if "confusion" not in each[0]:
+            continue
+        counts = np.sum([record["confusion"] for record in each], axis=0)
+        about = zip(classes[task], np.sum(each[0]["confusion"], axis=1).tolist(), each[0]["class_groups"], strict=True)
+        of_task = found.setdefault(task, {}).setdefault(
+            modality, [{"class": name, "rows": rows, "groups": groups, "scores": {}} for name, rows, groups in about]
+        )
+        right, said, true = counts.diagonal(), counts.sum(0), counts.sum(1)
+        for k, one in enumerate(of_task):
+            one["scores"][source] = [float(right[k] / n) if n else None for n in (said[k], true[k])]
+    return found
 
 
 def summarise_again(records: Sequence[dict[str, Any]], probe: str) -> dict[str, Any]:

@@ -6,7 +6,6 @@ All statistics come from images without labels. Shapes: features [N, D].
 import copy
 from collections.abc import Callable
 from functools import partial
-from typing import Literal
 
 import numpy as np
 
@@ -15,10 +14,10 @@ from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Pack
 from mvitac.data.spec import listed
 from mvitac.evaluation.features import features, sample
+from mvitac.evaluation.probe_config import Standardise
 from mvitac.model import Model
 from mvitac.transforms.gel_colours import MIN_IMAGES, NUM_IMAGES, GelColours, Looks, learn_colours, recolour
 
-Standardise = Literal["colours", "features"]
 NUM_STATISTICS = 256  # images of a sensor that statistics are taken from, at most
 COLOURS = "--standardise colours"  # the option of probe that errors name
 MAX_LOOKS = 4  # known sensors in whose colours a new one is shown, at most

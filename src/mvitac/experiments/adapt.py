@@ -15,8 +15,9 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.evaluate import check_channels, check_unseen
 from mvitac.evaluation.leaks import Scored, Source, read_sources
 from mvitac.evaluation.probe import probe_model, scorable, split_rows
+from mvitac.evaluation.probe_config import Standardise
 from mvitac.evaluation.retrieval import cross_modal, retrieved_rows
-from mvitac.evaluation.sensors import RecolouredPack, Standardise
+from mvitac.evaluation.sensors import RecolouredPack
 from mvitac.model import Model
 from mvitac.model_files import load
 from mvitac.nn.initial import Init

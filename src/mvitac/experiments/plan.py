@@ -9,7 +9,7 @@ from typing import Any, Literal
 from mvitac.data.spec import MODALITIES
 from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.controls import CONTROLS
-from mvitac.evaluation.probe import Probe
+from mvitac.evaluation.probe_config import Probe
 from mvitac.recipes import recipe, with_method
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run

@@ -27,6 +27,7 @@ MARKERS = ("o", "^", "s", "D", "v", "P", "X", "*")
 DASHES = ("-", "--", ":", "-.")
 
 LEAST = -0.5  # where figures cut off R2, which has no lower limit
+NUM_NUMBERED = 20  # largest number of classes of a confusion matrix with numbers
 WIDTH = 3.8  # inches. In the report's columns of about 360 px, 9 pt letters are then about 12 px high.
 STYLE: Any = matplotlib.rc_params_from_file(Path(__file__).with_suffix(".mplstyle"), use_default_template=False)
 
@@ -168,11 +169,13 @@ def confusion(title: str, counts: np.ndarray, classes: Sequence[str]) -> Figure:
     shares = counts / np.maximum(counts.sum(1, keepdims=True), 1)
     hues = np.where(np.eye(num, dtype=bool)[..., None], to_rgb(colour("blue")), to_rgb(colour("vermilion")))
     # Never opaque under a number.
-    alpha = np.where(shares > 0, 0.12 + (0.58 if num <= 8 else 0.88) * shares, 0)
-    edges, look = np.arange(num + 1) - 0.5, {"edgecolors": colour("panel"), "linewidth": 2 * (num <= 40)}
+    alpha = np.where(shares > 0, 0.12 + (0.58 if num <= NUM_NUMBERED else 0.88) * shares, 0)
+    edges, look = np.arange(num + 1) - 0.5, {"edgecolors": colour("panel"), "linewidth": 2 * (num <= 8) or num <= 40}
     axes.pcolormesh(edges, edges, np.dstack([hues, alpha]), **look)
-    for true, guess in zip(*np.nonzero(shares), strict=True) if num <= 8 else ():
-        axes.text(guess, true, f"{100 * shares[true, guess]:.0f}{' %' * (num <= 4)}", ha="center", va="center")
+    size: dict[str, Any] = {"fontsize": 110 / num} if num > 8 else {}
+    for true, guess in zip(*np.nonzero(shares), strict=True) if num <= NUM_NUMBERED else ():
+        text = f"{100 * shares[true, guess]:.0f}{' %' * (num <= 4)}"
+        axes.text(guess, true, text, ha="center", va="center", **size)
     axes.set_xlim(-0.5, num - 0.5)
     axes.set_ylim(num - 0.5, -0.5)
     axes.set_aspect("equal")

@@ -1,7 +1,6 @@
 """The report of finished runs as one HTML page: verdict, tables, curves, pictures, settings, cost. No network."""
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
@@ -16,13 +15,13 @@ from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import scorable
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.run_names import names_of
-from mvitac.evaluation.score_text import covered, percent, score_name, with_interval
+from mvitac.evaluation.score_text import WORDS, above, covered, headline, percent, score_name, verdicts, with_interval
 from mvitac.model_files import load
 from mvitac.registry import to_json
 from mvitac.report import galleries, score_sections, tables
 from mvitac.report import sections as evidence
 from mvitac.report.html import blocks as page
-from mvitac.report.sections import WORDS, Finished, Study
+from mvitac.report.sections import Finished, Study
 from mvitac.run import load_run, precision_of
 from mvitac.system.files import write_atomic
 from mvitac.system.progress import duration, shown, work
@@ -130,33 +129,39 @@ def _head(study: Study, title: str) -> Markup:
         "trunk": ", ".join(dict.fromkeys(r.run.encoder.named(modalities) for r in runs)),
         "input": ", ".join(dict.fromkeys(f"{r.run.augment.whole_of(m)} px" for r in runs for m in modalities)),
     }
-    text = "; ".join(verdicts(study)) or "nothing is scored on this data"
+    text = "; ".join(clauses(study)) or "nothing is scored on this data"
     text = f"{text[0].upper()}{text[1:]}."
+    for task, found in study.result["summary"].items():
+        text += "".join(f" On {task} {line}." for line in verdicts(found) if "ImageNet" in line)
     tiles = [_tile(study, task) for task in study.result["summary"]]
     return page.head(title, "Pre-training report", chips, text, tiles)
 
 
-def verdicts(study: Study) -> list[str]:
+def _headline(study: Study, task: str) -> tuple[str, dict[str, Any], dict[str, Any]]:
+    return headline(study.result["summary"][task], study.sources[0], study.sources)
+
+
+def clauses(study: Study) -> list[str]:
     """One clause per main result: the first task, and retrieval from touch to vision."""
-    clauses = []
+    said = []
     for task in list(study.result["summary"])[:1]:
-        modality, own, controls = evidence.headline(study, task)
+        modality, own, controls = _headline(study, task)
         mark = leak_mark(own.get("leak", ""))
         names = {"untrained": "untrained trunk", "imagenet": "frozen ImageNet trunk", "start": "frozen start"}
         beside = [f"{names.get(name, name)} {percent(cell['mean'])}" for name, cell in controls.items()]
         methods = study.result["summary"][task][modality]
         others = [f"{s} {percent(methods[s]['mean'])}" for s in study.sources[1:] if s in methods]
         by = f" with {study.sources[0]}" if others else ""
-        clauses.append(
+        said.append(
             ", ".join([f"{WORDS[modality]} reaches {_worded(methods, own)}{mark} on {task}{by}", *others, *beside])
         )
     found = tables.by_direction(study.result["retrieval"]).get((study.sources[0], "touch -> vision"))
     if found:
-        clauses.append(
+        said.append(
             f"a touch finds its {study.pack.spec.group_by} among the first five by camera in"
             f" {percent(tables.recall(found, 'R@5'))} % (chance {percent(tables.recall(found, 'chance R@5'))})"
         )
-    return clauses
+    return said
 
 
 def _worded(task: dict[str, Any], cell: dict[str, float]) -> str:
@@ -165,20 +170,15 @@ def _worded(task: dict[str, Any], cell: dict[str, float]) -> str:
 
 
 def _tile(study: Study, task: str) -> Markup:
-    modality, own, controls = evidence.headline(study, task)
-    below = [name for name, cell in controls.items() if _low(cell) > own["high"]]
-    level = [name for name, cell in controls.items() if cell["high"] >= _low(own) and name not in below]
-    found = [f"{word} {', '.join(names)}" for word, names in (("below", below), ("overlaps", level)) if names]
-    verdict = f"interval {' and '.join(found) or 'above every control'}" if controls else ""
+    modality, own, controls = _headline(study, task)
+    found = above(own, controls)
+    verdict = f"interval {found}" if controls else ""
     number, _, ends = with_interval(own["mean"], own["low"], own["high"], own.get("leak", "")).partition(" ")
     by = f", {study.sources[0]}" if len(study.sources) > 1 else ""
     about = ", ".join(["R2"] * (score_name(study.result["summary"][task]) == "R2") + [WORDS[modality] + by])
-    return page.tile(task, about, number, ends, verdict, "no" if found else "yes")
-
-
-def _low(cell: dict[str, float]) -> float:
-    """Lower end of an interval; R2 may have none."""
-    return -math.inf if cell["low"] is None else cell["low"]
+    if "balanced" in own:
+        ends += f"; balanced {percent(own['balanced'])}"
+    return page.tile(task, about, number, ends, verdict, "yes" if found.startswith("above") else "no")
 
 
 def flatten(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -8,9 +8,11 @@ from markupsafe import Markup
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import (
     MODALITY_ORDER,
+    WORDS,
     clipped_text,
     columns_of,
     error_text,
+    headline,
     percent,
     score_name,
     sources_of,
@@ -21,7 +23,7 @@ from mvitac.evaluation.scores import by_cell, summarise_again
 from mvitac.report import figures, tables
 from mvitac.report.html import blocks as html
 from mvitac.report.palette import CONTROL_GREYS, MODALITY_HUES
-from mvitac.report.sections import WORDS, Study, headline
+from mvitac.report.sections import Study
 
 
 def probe(study: Study) -> list[Markup]:
@@ -43,6 +45,7 @@ def probe(study: Study) -> list[Markup]:
         again = summarise_again(records, kind)
         names = " and ".join(dict.fromkeys(tables.probe_name(kind, score_name(cells)) for cells in again.values()))
         numbers.append(html.fold(f"The same by {names}", html.grid(_scores(study, again), "")))
+    numbers += _per_class(study)
     numbers += _every_probe(records)
     names = " or ".join(dict.fromkeys(tables.probe_name(kinds[0], score_name(found)) for found in summary.values()))
     by = study.pack.spec.group_by
@@ -112,6 +115,16 @@ def _target_table(study: Study, task: str, found: dict[str, Any]) -> Markup:
     return table + (html.paragraph(f"{clipped}.") if (clipped := clipped_text(found)) else "")
 
 
+def _per_class(study: Study) -> list[Markup]:
+    """Rows, groups, precision and recall of each class, folded: a table per task."""
+    found = []
+    for task, modality, sources, classes in tables.classes_of(study.result):
+        heads = ["class", "rows", "groups", *(f"{source}: precision / recall" for source in sources)]
+        table = html.table(heads, tables.class_rows(classes, sources), label=f"{task}: classes")
+        found.append(html.fold(f"Every class of {task}, by {WORDS[modality]}: precision and recall (%)", table))
+    return found
+
+
 def _every_probe(records: Sequence[dict[str, Any]]) -> list[Markup]:
     """Every score of every record, folded: one table of classes, one of values."""
     classes, values = [], []
@@ -144,7 +157,7 @@ def values(study: Study) -> list[Markup]:
     for task, found in study.result["summary"].items():
         if score_name(found) == "accuracy":
             continue
-        modality, own, controls = headline(study, task)
+        modality, own, controls = headline(found, study.sources[0], study.sources)
         mine = cells[task, modality, study.sources[0]]
         beside = {s: cells.get((task, modality, s)) or cells[task, "none", s] for s in controls}
         for t, target in enumerate(own["targets"]):

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from mvitac.data.pack import Pack
 from mvitac.evaluation.intervals import interval
 from mvitac.evaluation.retrieval import MIN_GALLERY, retrieved_rows
-from mvitac.evaluation.score_text import columns_of, sources_of
+from mvitac.evaluation.score_text import WORDS, headline
 from mvitac.model import Model
 from mvitac.report import figures, tables
 from mvitac.report.figures import Line
@@ -22,8 +22,6 @@ from mvitac.report.html import blocks as html
 from mvitac.report.palette import HUES, MODALITY_HUES
 from mvitac.run import Run
 from mvitac.system.files import write_atomic
-
-WORDS = {"touch": "touch", "vision": "vision", "both": "touch + vision"}  # the input of a probe, in words
 
 
 @dataclass(frozen=True)
@@ -197,7 +195,7 @@ def confusions(study: Study) -> list[Markup]:
     for task, classes in study.result["classes"].items():
         if source not in {s for cells in study.result["summary"].get(task, {}).values() for s in cells}:
             continue
-        modality = headline(study, task)[0]
+        modality = headline(study.result["summary"][task], source, study.sources)[0]
         kind = study.result["records"][0]["probe"]
         wanted = {"task": task, "modality": modality, "source": source, "probe": kind}
         found = [r for r in study.result["records"] if all(r[k] == v for k, v in wanted.items())]
@@ -210,13 +208,3 @@ def confusions(study: Study) -> list[Markup]:
         return []
     intro = f"Each row is a true class and sums to 100 %: blue is correct, orange is a mistake ({source})."
     return [html.paragraph(intro), html.grid(drawn)]
-
-
-def headline(study: Study, task: str) -> tuple[str, dict[str, Any], dict[str, dict[str, Any]]]:
-    """The modality to show (both, else the best), the first method's score on it, and those of the controls."""
-    found, source = study.result["summary"][task], study.sources[0]
-    have = [m for m in columns_of(found) if source in found[m]]
-    modality = "both" if "both" in have else max(have, key=lambda m: found[m][source]["mean"])
-    beside = {**found.get("none", {}), **found[modality]}
-    controls = {s: beside[s] for s in sources_of(found) if s in beside and s not in study.sources}
-    return modality, found[modality][source], controls

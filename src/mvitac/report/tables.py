@@ -1,6 +1,7 @@
 """Probe results as tables for a terminal 80 columns wide, and the rows that every table of results shares."""
 
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Iterator, Sequence
 from typing import Any, TextIO
 
 from tabulate import tabulate
@@ -9,21 +10,27 @@ from mvitac.evaluation.intervals import interval, paired_difference
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import VALUE_PROBES
 from mvitac.evaluation.score_text import (
+    WORDS,
+    balanced_rows,
     cell_text,
     clipped_text,
     columns_of,
     covered,
     error_text,
+    headline,
+    methods_of,
     percent,
     score_name,
     sources_of,
     tested_on,
+    verdicts,
     with_interval,
 )
 from mvitac.evaluation.scores import leaks_in
 
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
 VALUE_PROBE_NAMES = {"linear": "ridge regression"}
+NUM_BESIDE = 3  # sources side by side in a table of classes
 RETRIEVAL = ("R@1", "R@5", "R@10", "chance R@5")  # columns of a retrieval table, in percent
 
 
@@ -54,7 +61,10 @@ def print_summary(result: dict[str, Any], file: TextIO | None = None, *, probe: 
         title = f"{result['data']}: {name} ({about})"
         # LEAK on a line of its own, else the table is too wide.
         rows = [[cell.replace(" LEAK", "\nLEAK") for cell in row] for row in score_rows(task, modalities)]
-        print(text_table(title, [f"{score} %", *modalities], rows), file=file)
+        print(text_table(title, [f"{score} %", *modalities], rows).rstrip(), file=file)
+        for line in verdicts(task):
+            print(textwrap.fill(line, 80, subsequent_indent="  "), file=file)
+        print(file=file)
         if score == "R2":
             print(_targets(name, task), file=file)
         if clipped := clipped_text(task):
@@ -80,8 +90,37 @@ def _targets(name: str, task: dict[str, Any]) -> str:
 
 
 def score_rows(task: dict[str, Any], modalities: Sequence[str]) -> list[list[str]]:
-    """Rows of source and its score at each of ``modalities``, of one task's summary."""
-    return [[source, *(cell_text(task, source, m) for m in modalities)] for source in sources_of(task)]
+    """Rows of source and its score at each of ``modalities``, of one task's summary; of uneven classes balanced ones too."""
+    rows = [[source, *(cell_text(task, source, m) for m in modalities)] for source in sources_of(task)]
+    return rows + balanced_rows(task, modalities)
+
+
+def classes_of(result: dict[str, Any]) -> Iterator[tuple[str, str, list[str], list[dict[str, Any]]]]:
+    """Task, modality of the headline, sources and classes (``scores.per_class``) of each task of a probe's result.
+
+    The sources are the methods, the untrained trunk and the pixels.
+    """
+    for task, found in result.get("per_class", {}).items():
+        methods = methods_of(result["summary"][task])
+        modality = headline(result["summary"][task], methods[0], methods)[0] if methods else "touch"
+        if classes := found.get(modality):
+            yield task, modality, [s for s in (*methods, "untrained", "pixels") if s in classes[0]["scores"]], classes
+
+
+def class_rows(classes: Sequence[dict[str, Any]], sources: Sequence[str]) -> list[list[str]]:
+    """Rows of class, its rows and groups, and "precision / recall" of each source in percent; "-" where there is none."""
+    scores = [[" / ".join("-" if v is None else percent(v) for v in c["scores"][s]) for s in sources] for c in classes]
+    return [[c["class"], str(c["rows"]), str(c["groups"]), *s] for c, s in zip(classes, scores, strict=True)]
+
+
+def print_classes(result: dict[str, Any], file: TextIO | None = None) -> None:
+    """Print precision and recall of each class, a table per task; of several methods in several tables."""
+    for task, modality, sources, classes in classes_of(result):
+        title = f"{task} by {WORDS[modality]}: precision / recall of each class, %"
+        for start in range(0, len(sources), NUM_BESIDE):
+            some = sources[start : start + NUM_BESIDE]
+            rows = class_rows([{**c, "class": c["class"][:16]} for c in classes], some)
+            print(text_table(title, ["class", "rows", "groups", *some], rows), file=file)
 
 
 def target_rows(task: dict[str, Any]) -> list[tuple[str, str, list[dict[str, Any] | None]]]:

@@ -139,7 +139,7 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
                 check_still_there(out)
                 checkpoint.save(out, run, method, step.optimiser, done, kept=setup.kept)
             if stop and not last:
-                raise Interrupted(f"stopped after step {done} of {num_steps}; continue with --resume --out {out}")
+                raise Interrupted(f"stopped after step {done} of {num_steps}; {out} continues with resume")
     if world.writes:
         Model(method, run, setup.spec, pack.size).save(out / "model.safetensors")
         check_still_there(out)

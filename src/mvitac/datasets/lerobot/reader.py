@@ -54,6 +54,10 @@ class LeRobotConfig(RowsConfig):
     """Use every n-th row of each episode, because consecutive rows are near-duplicates."""
     group: str | None = "episode"
 
+    @classmethod
+    def reads(cls, path: Path) -> bool:
+        return (path / "meta" / "info.json").is_file()
+
     def __post_init__(self) -> None:
         super().__post_init__()
         check_range(self, 0, math.inf, "tolerance")

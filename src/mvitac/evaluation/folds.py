@@ -1,0 +1,53 @@
+"""Folds for small sets: every group is tested once, by probes fitted on the others.
+
+Groups that a run learned from, also without their labels, are always fitted on and never tested.
+"""
+
+import copy
+from collections.abc import Sequence
+
+import numpy as np
+import pyarrow as pa
+from sklearn.model_selection import StratifiedGroupKFold
+
+from mvitac.data.pack import Pack
+from mvitac.data.row_hashes import row_hashes
+from mvitac.data.spec import AnyTask, ValueTask
+from mvitac.evaluation.leaks import Source
+
+
+def fold_splits(pack: Pack, task: AnyTask, num: int, learned: Sequence[Source]) -> list[np.ndarray]:
+    """The split of every row [N] in each of ``num`` folds of a task: "test", "train", or "hidden" where it has no answer.
+
+    Whole groups; classes, or quarters of the first value, are shared out as evenly as they allow. ValueError if fewer than
+    ``num`` groups were not ``learned`` from.
+    """
+    known = pack.answered(task) & np.isin(pack.column(task.split), ("train", "val", "test"))
+    seen = np.isin(row_hashes(pack)[1], np.concatenate([[np.uint64(0)], *(source.groups for source in learned)]))
+    rows = np.flatnonzero(known & ~seen)
+    groups = pack.column("group")[rows].astype(str)
+    if (left := len(set(groups))) < num:
+        by = pack.spec.group_by
+        raise ValueError(f"task {task.name!r} has {left} {by}s that no run learned from: give --folds 2 to {left}")
+    if isinstance(task, ValueTask):
+        first = np.nan_to_num(pack.values(task)[rows, 0])
+        strata = np.searchsorted(np.quantile(first, [0.25, 0.5, 0.75]), first)
+    else:
+        strata = pack.labels(task.name)[rows]
+    found = []
+    for _, test in StratifiedGroupKFold(num, shuffle=True, random_state=0).split(rows, strata, groups):
+        split = np.where(known, "train", "hidden")
+        split[rows[test]] = "test"
+        found.append(split)
+    return found
+
+
+def with_split(pack: Pack, task: AnyTask, split: np.ndarray) -> Pack:
+    """``pack`` with this ``split`` [N] of ``task``."""
+    made = copy.copy(pack)
+    made.table = pack.table.set_column(
+        pack.table.schema.get_field_index(task.split), task.split, pa.array(split.tolist())
+    )
+    for name in ("_answers", "hidden"):
+        made.__dict__.pop(name, None)  # kept from the old split
+    return made
