@@ -19,7 +19,8 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.hub import HubConfig
-from mvitac.datasets.lerobot.reader import LeRobotConfig, _nearest, choose
+from mvitac.datasets.lerobot.reader import LeRobotConfig, choose
+from mvitac.datasets.table.clocks import nearest
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.datasets.webdataset import WebDatasetConfig
 from support.videos import film, shade
@@ -131,11 +132,11 @@ def test_lerobot_takes_no_frame_of_another_episode(tmp_path: Path) -> None:
 
 def test_nearest_of_two_rates() -> None:
     times, wanted = np.arange(10) / 15, np.arange(20) / 30 + 0.01
-    at, away = _nearest(times, wanted)
+    at, away = nearest(times, wanted)
     brute = np.abs(times[None] - wanted[:, None])
     assert np.allclose(away, brute.min(1))
     assert np.allclose(brute[np.arange(20), at], brute.min(1))
-    assert _nearest(np.array([2.0]), np.array([1.0, 5.0]))[1].tolist() == [1.0, 3.0]
+    assert nearest(np.array([2.0]), np.array([1.0, 5.0]))[1].tolist() == [1.0, 3.0]
 
 
 def test_cameras_are_chosen_or_guessed() -> None:

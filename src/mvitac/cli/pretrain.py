@@ -55,7 +55,9 @@ def pretrain(argv: list[str]) -> None:
         options = parse(_Options, rest, "pretrain", default=replace(usual, run=_chosen_run(chosen, pack.phased)))
     with open_loggers(chosen.get("--logger"), options.out, options.run) as loggers:
         out = train(options.run, options.out, resume=options.resume, quiet=options.quiet, loggers=loggers, pack=pack)
-    print(f"trained: {out}\nnext: mvitac probe {out}")
+    data = read_record(out / "run.json")[1].get("data", {})
+    known = "probe" if data.get("tasks") or data.get("values") else "explore"
+    print(f"trained: {out}\nnext: mvitac {known} {out}")
 
 
 def _chosen_run(chosen: dict[str, str], phased: bool) -> Run:

@@ -1,4 +1,4 @@
-"""``--data folder``: your own images, listed in a manifest, stored in HDF5 files or arranged in class folders.
+"""``--data folder``: your own images, in a table, HDF5 files, videos or folders.
 
 A **manifest** (.csv, .parquet or .jsonl) has one row per sample; its paths are relative to its own folder, or absolute:
 
@@ -16,6 +16,14 @@ A path may be a **video**; column ``frame`` (or ``touch_frame``, ``vision_frame`
     <root>/left/<class>/...                     <root>/right/<class>/...                 two sensors instead of touch
     <root>/<class>/<name>.jpg                   one modality (see ``pictures``)
 
+**Recordings** need neither table nor labels. Two cameras of a recording are paired by time:
+
+    <root>/<name>.mp4                           one camera (see ``pictures``), each video is a recording and a group
+    <root>/<name>/gel.mp4  camera.mp4           two cameras: ``touch`` gel, ``vision`` camera
+    <root>/touch/<name>.mp4  vision/<name>.mp4  the same by folders; vision, touch, left and right need no option
+    <root>/gel_timestamps.csv, .txt             the time of each frame of gel.mp4, if the container's is not right
+    <root>/<number>.jpg                         one recording of one camera; a number of seconds since 1970 is its time
+
 An **HDF5 file** (.h5, .hdf5), or a folder of them, holds images and numbers as datasets with one row per frame
 (``mvitac.datasets.table.hdf5``); ``vision`` and ``touch`` name image datasets:
 
@@ -27,14 +35,18 @@ split folders, split. A manifest is checked completely before the first image is
 the header.
 """
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
+from mvitac.data.video import VIDEOS
+from mvitac.datasets.table.folders import list_images, list_videos, to_train
 from mvitac.datasets.table.hdf5 import read_hdf5
 from mvitac.datasets.table.image_refs import HDF5
-from mvitac.datasets.table.manifest import READERS, Manifest, list_class_folders, read_manifest
+from mvitac.datasets.table.manifest import READERS, Manifest, read_manifest
 from mvitac.datasets.table.table import RowsConfig
+from mvitac.registry import check_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,10 +56,18 @@ class FolderConfig(RowsConfig):
     name: ClassVar[str] = "folder"
 
     path: Path = Path("data")
-    """A manifest (.csv, .parquet, .jsonl), a folder with a manifest.*, an HDF5 file (.h5, .hdf5) or a folder of them, or
-    a folder of class folders."""
+    """A manifest (.csv, .parquet, .jsonl), an HDF5 file, a video, or a folder with manifest.*, of HDF5 files, of videos,
+    of class folders or of images."""
     pictures: Literal["touch", "vision"] = "touch"
-    """Modality of plain class folders (<root>/<class>/*.jpg)."""
+    """Modality of images and videos that nothing names (<root>/<class>/*.jpg, <root>/*.mp4)."""
+
+    every: int | None = None
+    """Without a table: use every n-th frame of a recording; by default every fifth of a video and all images."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.every is not None:
+            check_range(self, 1, math.inf, "every")
 
     def manifest(self) -> Manifest:
         files = sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
@@ -61,6 +81,12 @@ class FolderConfig(RowsConfig):
         if arrays := [file for file in files if file.suffix.lower() in HDF5 and file.is_file()]:
             images = [name for name in (self.vision, *self.touch, *self.background) if name]
             return read_hdf5(self.path, arrays, images, self.vectors())
-        if not self.path.is_dir():
-            raise ValueError(f"{self.path} is no table: its name must end in {', '.join((*READERS, *HDF5))}")
-        return list_class_folders(self.path, self.pictures)
+        cameras = [name for name in (*self.touch, self.vision) if name]
+        found = list_videos(self.path, cameras, self.pictures, self.every, self.tolerance)
+        if not found and not self.path.is_dir():
+            raise ValueError(f"{self.path} is no table: its name must end in {', '.join((*READERS, *HDF5, *VIDEOS))}")
+        found = found or list_images(self.path, self.pictures, self.every)
+        return found if self.labels or self.values else to_train(found)
+
+    def unused(self) -> tuple[str, ...]:
+        return (*super().unused(), *(("every",) if self.every is None else ()))

@@ -23,6 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mvitac.data.video import frame_times
+from mvitac.datasets.table.clocks import nearest
 from mvitac.datasets.table.image_refs import Frame, ImageRef, ParquetCell
 from mvitac.datasets.table.manifest import Manifest, text_of
 from mvitac.datasets.table.table import RowsConfig
@@ -60,8 +61,10 @@ class LeRobotConfig(RowsConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range(self, 0, math.inf, "tolerance")
         check_range(self, 1, math.inf, "every")
+
+    def unused(self) -> tuple[str, ...]:
+        return tuple(name for name in super().unused() if name != "tolerance")
 
     def manifest(self) -> Manifest:
         info = _info(self.path)
@@ -97,7 +100,7 @@ class LeRobotConfig(RowsConfig):
             # One file has several episodes: the nearest frame must be of the same episode.
             low, high = np.searchsorted(times[file], [start - 1e-3, (np.inf if end is None else end) - 1e-3])
             when = start + np.array([float(rows[i]["timestamp"]) for i in numbers])
-            at, away = _nearest(times[file][low:high], when)
+            at, away = nearest(times[file][low:high], when)
             for i, frame, miss, moment in zip(numbers, (low + at).tolist(), away.tolist(), when.tolist(), strict=True):
                 if miss <= self.tolerance:
                     places[i] = Frame(str(file), frame)
@@ -107,16 +110,6 @@ class LeRobotConfig(RowsConfig):
                         f" {miss:.3f} s away): give a larger --data.tolerance, or --data.allow-missing"
                     )
         return places
-
-
-def _nearest(times: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index in ascending ``times`` [N] nearest to each of ``wanted`` [M], and the distance in seconds."""
-    if not len(times):
-        return np.zeros(len(wanted), int), np.full(len(wanted), np.inf)
-    after = np.minimum(np.searchsorted(times, wanted), len(times) - 1)
-    before = np.maximum(after - 1, 0)
-    at = np.where(np.abs(times[after] - wanted) < np.abs(times[before] - wanted), after, before)
-    return at, np.abs(times[at] - wanted)
 
 
 def choose(cameras: Sequence[str], vision: str | None, touch: tuple[str, ...], where: Path) -> dict[str, str]:

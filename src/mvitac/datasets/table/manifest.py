@@ -1,4 +1,4 @@
-"""A table of samples, read from a manifest file, made from class folders, or by a reader of another layout.
+"""A table of samples, read from a manifest file, or made by a reader of another layout.
 
 Cells are text, whatever the file format, because a pack keeps them so: typing a CSV would turn the label 007 into 7.
 Rows are counted from 1, without the header.
@@ -19,8 +19,6 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from mvitac.data.images import IMAGES
-from mvitac.data.pack_table import SPLITS
 from mvitac.data.video import VIDEOS
 from mvitac.datasets.table.image_refs import Frame, ImageRef
 from mvitac.registry import unknown
@@ -48,6 +46,8 @@ class Manifest:
     """Default column of the group."""
     left_out: dict[str, str] = field(default_factory=dict)
     """What the file has and is no column -> why."""
+    notes: tuple[str, ...] = ()
+    """What is printed with every result."""
 
     @classmethod
     def of(
@@ -238,46 +238,3 @@ READERS: dict[str, Callable[[Path], list[dict[str, Any]]]] = {
     ".parquet": lambda file: pq.ParquetFile(file).read().to_pylist(),
     ".jsonl": _read_jsonl,
 }
-
-
-def list_class_folders(root: Path, pictures: str) -> Manifest:
-    """Return the manifest of a tree of class folders (the layouts are in ``mvitac.datasets.folder``).
-
-    ``pictures`` is the modality of the images if no folders name it. A file without a counterpart leaves a cell empty.
-    """
-    splits = [split for split in SPLITS if (root / split).is_dir()]
-    for other in sorted(root.iterdir()) if splits else ():
-        if other.name not in SPLITS and other.is_dir() and _images_below(other):
-            raise ValueError(f"{root} has images in {other.name} beside {', '.join(splits)}: rename or remove it")
-    rows = [row for split in splits or [""] for row in _split_rows(root, split, pictures)]
-    if not rows:
-        raise ValueError(f"{root} holds no manifest, HDF5 file or class folders with images ({', '.join(IMAGES)})")
-    return Manifest.of(root, rows, labels=("label",))
-
-
-def _split_rows(root: Path, split: str, pictures: str) -> list[Row]:
-    """Return the rows of the class folders in folder ``split`` ("" = ``root`` itself)."""
-    base = root / split
-    named = [name for name in ("vision", "touch", "left", "right") if (base / name).is_dir()]
-    found = {name: _images_below(base / name) for name in named} or {pictures: _images_below(base)}
-    rows = []
-    for key in sorted(set().union(*found.values())):
-        label, *below = key.split("/")
-        if not below:
-            raise ValueError(f"{base}: {key}.* is not in a class folder: put it in one, named by its class")
-        row = {n: images[key].relative_to(root).as_posix() if key in images else "" for n, images in found.items()}
-        group = key.rpartition("/")[0] if len(below) > 1 else f"{split}/{key}"
-        rows.append({**row, "label": label, "group": group, **({"split": split} if split else {})})
-    return rows
-
-
-def _images_below(folder: Path) -> dict[str, Path]:
-    """Return the images below ``folder`` by their path in it, without the suffix."""
-    found: dict[str, Path] = {}
-    for path in sorted(folder.rglob("*")):
-        if path.suffix.lower() in IMAGES and path.is_file():
-            key = path.relative_to(folder).with_suffix("").as_posix()
-            if key in found:
-                raise ValueError(f"{found[key]} and {path} differ in their suffix only: keep one of them")
-            found[key] = path
-    return found

@@ -11,14 +11,14 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from mvitac.data.source import Lost, Sample, Source, one_stamp
 from mvitac.data.spec import AnyTask, DataSpec
 from mvitac.datasets.base import KEEPING, DatasetConfig
-from mvitac.datasets.table import columns, image_columns, splits
+from mvitac.datasets.table import clocks, columns, image_columns, splits
 from mvitac.datasets.table.columns import Condition, all_hold, value_task
 from mvitac.datasets.table.image_columns import Background
 from mvitac.datasets.table.manifest import Manifest
@@ -88,6 +88,13 @@ class RowsConfig(DatasetConfig, ABC):
     no_contact: tuple[str, ...] = ()
     """Conditions on rows without contact, e.g. "phase=empty". They are not samples: the mean of the first 16 of a sensor
     is its background."""
+    log: tuple[str, ...] = ()
+    """Logs with a clock of their own, as FILE:COLUMN (the column of time stamps), e.g. force.csv:stamp; stamp-0.35 sets
+    that clock back. Their columns are joined to the rows by time (``datasets/table/clocks.py``)."""
+    tolerance: float = 0.02
+    """Largest distance in seconds of a row from a measurement of its logs, or a frame of its other cameras."""
+    interpolate: Literal["linear", "nearest"] = "linear"
+    """How the numbers of values are taken from logs. Other columns are of the nearest time."""
     licence: str = "unknown"
     """Licence of the data."""
     source_url: str = ""
@@ -96,7 +103,7 @@ class RowsConfig(DatasetConfig, ABC):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_range(self, 0, 1, "test_share", "val_share")
-        check_range(self, 0, math.inf, "split_seed")
+        check_range(self, 0, math.inf, "split_seed", "tolerance")
         if self.test_share + self.val_share >= 1:
             raise ValueError(f"test_share {self.test_share} and val_share {self.val_share} leave nothing to train on")
         if self.background and self.no_contact:
@@ -149,6 +156,10 @@ class RowsConfig(DatasetConfig, ABC):
     def source(self) -> Source:
         return Rows(self)
 
+    def unused(self) -> tuple[str, ...]:
+        """Options without effect, which are not part of what identifies a pack."""
+        return () if self.log else ("log", "tolerance", "interpolate")
+
 
 class Rows(Source):
     """Reads a table. An item is one row, or the rows of one video (one row group, ...), which are read in one pass."""
@@ -158,7 +169,7 @@ class Rows(Source):
     def __init__(self, config: RowsConfig) -> None:
         self._config = config
         self._title = config.title or (config.path if config.path.is_dir() else config.path.parent).resolve().name
-        table = columns.with_elements(config.manifest(), config.numbers())
+        table = columns.with_elements(self._joined(config.manifest()), config.numbers())
         self._digest = table.digest
         self._vision, self._touch = image_columns.find(table, config.vision, config.touch)
         self._images = tuple(column for column in (self._vision, *self._touch) if column)
@@ -208,6 +219,13 @@ class Rows(Source):
             notes=self._notes(table, group_by, assigned, {task.name: label for task, label in read}),
             difference=config.difference,
         )
+
+    def _joined(self, table: Manifest) -> Manifest:
+        """Return ``table`` with the columns of the logs."""
+        config, names = self._config, ("touch", "left", "right", "vision")
+        images = [name for name in (*config.touch, config.vision, *names) if name]
+        how: Any = {"tolerance": config.tolerance, "linear": config.interpolate == "linear"}
+        return clocks.join(table, config.log, images, numbers=config.numbers(), **how) if config.log else table
 
     def _row_bytes(self) -> int:
         return 3 * self._config.size**2 * len(self._images)
@@ -264,18 +282,18 @@ class Rows(Source):
     def _notes(
         self, table: Manifest, group_by: str, assigned: Sequence[str], labels: dict[str, list[int]]
     ) -> tuple[str, ...]:
-        """What results say about groups that no column names."""
+        """What results say about logs, and about groups that no column names."""
         if group_by == "video":
-            return ("no column says the groups, so frames of one video are one group",)
+            return (*table.notes, "no column says the groups, so frames of one video are one group")
         if group_by != "row":
-            return ()
+            return table.notes
         known = {*labels, self._split, self._sensor, *self._images}
         texts = {name: [row[name] for row in table.rows] for name in table.rows[0] if name not in known}
         for column in self._images:  # file names up to their last number
             files = (os.path.splitext(os.path.basename(ref.path))[0] if ref else "" for ref in table.images[column])
             if (stems := [re.sub(r"\d+\D*$", "", file) for file in files]) not in texts.values():
                 texts[f"{column} files"] = stems
-        return (columns.ungrouped(texts, assigned, [*labels.values()]),)
+        return (*table.notes, columns.ungrouped(texts, assigned, [*labels.values()]))
 
     def _make_rows(
         self,
@@ -310,12 +328,13 @@ class Rows(Source):
         return [len(item) for item in self._items]
 
     def fingerprint(self) -> dict[str, Any]:
+        unused = ("path", *KEEPING, *self._config.unused())
         return {
             "reader": f"{self._config.name} {VERSION}",
             "title": self._title,
             "manifest": self._digest,
             "file_sizes": digest(self._sizes),
-            "options": {k: v for k, v in to_json(self._config).items() if k not in ("path", *KEEPING)},
+            "options": {k: v for k, v in to_json(self._config).items() if k not in unused},
         }
 
     def stamps(self) -> list[int]:

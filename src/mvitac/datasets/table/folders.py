@@ -1,0 +1,172 @@
+"""Folders without a table: class folders, images or videos (the layouts are in ``mvitac.datasets.folder``).
+
+Frames have the columns recording (their group), frame and, where it is known, time in seconds and minute.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mvitac.data.images import IMAGES
+from mvitac.data.pack_table import SPLITS
+from mvitac.data.spec import STAMPS
+from mvitac.data.video import VIDEOS, frame_times
+from mvitac.datasets.table.clocks import nearest, seconds
+from mvitac.datasets.table.image_refs import Frame, ImageRef
+from mvitac.datasets.table.manifest import READERS, Manifest, Row, number_of, read_manifest
+
+CAMERAS = ("touch", "left", "right", "vision")
+EVERY = 5
+"""Every how many frames of a video are used by default."""
+VAL = 10
+"""Without labels, every tenth recording is in val; of fewer recordings, the last tenth of the frames."""
+
+
+def list_images(root: Path, plain: str, every: int | None) -> Manifest:
+    """Return the table of the images below ``root``: of class folders, or of one recording.
+
+    A file without a counterpart leaves a cell empty.
+
+    Args:
+        root: The folder.
+        plain: Modality of the images if no folders name it.
+        every: Of a recording, every how many images are used.
+    """
+    splits = [split for split in SPLITS if (root / split).is_dir()]
+    for other in sorted(root.iterdir()) if splits else ():
+        if other.name not in SPLITS and other.is_dir() and _images_below(other):
+            raise ValueError(f"{root} has images in {other.name} beside {', '.join(splits)}: rename or remove it")
+    rows = [row for split in splits or [""] for row in _split_rows(root, split, plain, every or 1)]
+    if not rows:
+        raise ValueError(f"{root} holds no manifest, HDF5 file, videos or images ({', '.join(IMAGES)})")
+    if all("label" in row for row in rows):
+        return Manifest.of(root, rows, labels=("label",))
+    return Manifest.of(root, rows, group="recording")
+
+
+def _split_rows(root: Path, split: str, plain: str, every: int) -> list[Row]:
+    """Return the rows of the images in folder ``split`` ("" = ``root`` itself)."""
+    base = root / split
+    named = [name for name in CAMERAS if (base / name).is_dir()]
+    found = {name: _images_below(base / name) for name in named} or {plain: _images_below(base)}
+    keys = sorted(set[str]().union(*found.values()))
+    flat = [key for key in keys if "/" not in key]
+    if flat and len(flat) < len(keys):
+        raise ValueError(f"{base}: {flat[0]}.* is not in a class folder: put it in one, named by its class")
+    numbers = [number_of(key) for key in flat]
+    if flat and None not in numbers:  # 2 comes before 10
+        keys = [key for _, key in sorted(zip(numbers, flat, strict=True))]
+    times = seconds(keys) if flat and None not in numbers else np.zeros(1)
+    stamped = times.min() > 1e9  # since 1970; smaller numbers count the images
+    rows = []
+    for i, key in enumerate(keys):
+        row = {n: images[key].relative_to(root).as_posix() if key in images else "" for n, images in found.items()}
+        more = {"split": split} if split else {}
+        if not flat:
+            label, *below = key.split("/")
+            row |= {"label": label, "group": key.rpartition("/")[0] if len(below) > 1 else f"{split}/{key}"}
+        elif i % every:
+            continue
+        else:
+            row |= _frame(base.resolve().name, i, float(times[i]) if stamped else None)
+        rows.append({**row, **more})
+    return rows
+
+
+def _images_below(folder: Path) -> dict[str, Path]:
+    """Return the images below ``folder`` by their path in it, without the suffix."""
+    found: dict[str, Path] = {}
+    for path in sorted(folder.rglob("*")):
+        if path.suffix.lower() in IMAGES and path.is_file():
+            key = path.relative_to(folder).as_posix().removesuffix(path.suffix)
+            if key in found:
+                raise ValueError(f"{found[key]} and {path} differ in their suffix only: keep one of them")
+            found[key] = path
+    return found
+
+
+def list_videos(path: Path, names: Sequence[str], plain: str, every: int | None, tolerance: float) -> Manifest | None:
+    """Return the table of the videos at ``path`` or below it, None if there are none.
+
+    It has every n-th frame of a recording's first camera, and the frames of its other cameras at that time.
+
+    Args:
+        path: A video, or a folder.
+        names: Names of cameras besides ``CAMERAS``, the most important first.
+        plain: Modality of a video without such a name.
+        every: Every how many frames are used.
+        tolerance: Largest distance in seconds between frames of two cameras; rows with a larger one are left out.
+    """
+    names = tuple(dict.fromkeys((*names, *CAMERAS)))
+    recordings: dict[str, dict[str, Path]] = {}
+    for video in sorted(path.rglob("*")) if path.is_dir() else [path]:
+        if video.suffix.lower() in VIDEOS:
+            parts = [*video.relative_to(path).parts[:-1], video.stem] if path.is_dir() else [video.stem]
+            camera = next((name for name in names if name in parts), plain)
+            recording = "/".join(part for part in parts if part != camera) or path.resolve().stem
+            known = recordings.setdefault(recording, {}).setdefault(camera, video)
+            if known != video:
+                raise ValueError(f"{known} and {video} are both {camera} of {recording}: rename one")
+    if not recordings:
+        return None
+    cameras = [name for name in names if any(name in files for files in recordings.values())]
+    rows: list[Row] = []
+    images: dict[str, list[ImageRef | None]] = {camera: [] for camera in cameras}
+    away, alone = 0.0, 0
+    for recording, files in sorted(recordings.items()):
+        times = {camera: _times(file) for camera, file in files.items()}
+        own = times[next(camera for camera in cameras if camera in files)]
+        shown = np.arange(0, len(own), every or EVERY)
+        at = {camera: nearest(each, own[shown]) for camera, each in times.items()}
+        apart = np.max([miss for _, miss in at.values()], axis=0)
+        alone += int((apart > tolerance).sum())
+        for i in np.flatnonzero(apart <= tolerance):
+            away = max(away, float(apart[i]))
+            rows.append(_frame(recording, int(shown[i]), float(own[shown[i]])))
+            for camera in cameras:
+                ref = Frame(str(files[camera]), int(at[camera][0][i])) if camera in files else None
+                images[camera].append(ref)
+    note = f"{' and '.join(cameras)} are paired by time, at most {away:.3g} s apart"
+    note += f"; {alone} frames without a partner within {tolerance:g} s are left out" * bool(alone)
+    where = {camera: [str(ref).removeprefix(str(path)) for ref in refs] for camera, refs in images.items()}
+    notes = (note,) if len(cameras) > 1 else ()
+    return Manifest.of(path, rows, images, content=where, group="recording", notes=notes)
+
+
+def _times(video: Path) -> np.ndarray:
+    """Return the times [N] of the frames in seconds: of the file VIDEO_timestamps.csv or .txt, else of the container."""
+    times = frame_times(video)
+    beside = [video.with_name(f"{video.stem}_timestamps{suffix}") for suffix in (".txt", *READERS)]
+    file = next((file for file in beside if file.is_file()), None)
+    if file is None:
+        return times
+    if file.suffix == ".txt":
+        stamps = seconds([line.strip() for line in file.read_text().splitlines() if line.strip()])
+    else:
+        table = read_manifest(file)
+        stamps = seconds(table.filled(next((c for c in STAMPS if c in table.columns), table.columns[0]), "time"))
+    if len(stamps) != len(times):
+        raise ValueError(f"{file} has {len(stamps)} times, {video.name} has {len(times)} frames")
+    return stamps
+
+
+def _frame(recording: str, frame: int, time: float | None) -> Row:
+    row = {"id": f"{recording}/{frame:06d}", "recording": recording, "frame": str(frame)}
+    return row if time is None else row | {"time": f"{time:.6f}", "minute": f"{recording}/{int(time // 60)}"}
+
+
+def to_train(table: Manifest) -> Manifest:
+    """Return ``table`` of recordings without labels, all of it to train on but a little val."""
+    if "recording" not in table.columns or "split" in table.columns:
+        return table
+    rows: list[Row] = []
+    names = list(dict.fromkeys(row["recording"] for row in table.rows))
+    for number, name in enumerate(names):
+        own = [row for row in table.rows if row["recording"] == name]
+        whole, last = len(names) >= VAL, len(own) - max(1, len(own) // VAL)
+        for i, row in enumerate(own):
+            val = number % VAL == VAL - 1 if whole else i >= last
+            group = f"{name}, its end" if val and not whole else name
+            rows.append({**row, "recording": group, "split": "val" if val else "train"})
+    return table.of(table.path, rows, table.images, content=table.digest, group="recording", notes=table.notes)

@@ -1,0 +1,201 @@
+"""Two clocks: logs and second cameras joined by time, and recordings without a table."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.datasets.folder import FolderConfig
+from mvitac.datasets.table.clocks import seconds
+from support.films import film, shade
+
+START = 1_700_000_000.0
+
+
+def packed(path: Path, out: Path, **options: Any) -> Pack:
+    config = FolderConfig(path=path, size=16, **options)
+    return build(config.source(), out, size=16, quiet=True)
+
+
+def write_csv(file: Path, **columns: Any) -> Path:
+    lines = [",".join(columns), *(",".join(map(str, cells)) for cells in zip(*columns.values(), strict=True))]
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text("\n".join(lines))
+    return file
+
+
+def force(times: np.ndarray) -> np.ndarray:
+    return 3 * times + 1
+
+
+def recorded(root: Path, *, num: int = 3, shift: float = 0.0, ends: tuple[float, float] = (-0.1, 2.1)) -> Path:
+    """Videos of 50 frames at 25 Hz, each with a force log at 100 Hz; Fz = 3 t + 1, label = the second."""
+    for k in range(num):
+        film(root / f"{k}/gel.mp4", 50, which=k)
+        times = np.arange(*ends, 0.01) + 0.003
+        write_csv(root / f"{k}/force.csv", stamp=times + shift, Fz=force(times), kind=(times >= 1).astype(int))
+    return root
+
+
+LOG: dict[str, Any] = {"touch": ("gel",), "log": ("force.csv:stamp",), "values": ("Fz:N",), "every": 1}
+
+
+@pytest.mark.parametrize("how", ["linear", "nearest"])
+def test_a_log_is_joined_by_time(tmp_path: Path, how: Any) -> None:
+    pack = packed(recorded(tmp_path / "set"), tmp_path / "p", labels=("kind",), interpolate=how, **LOG)
+    time, found = pack.column("time").astype(float), pack.values(pack.spec.values[0])[:, 0]
+    assert pack.num == 150 and pack.spec.group_by == "recording" and set(pack.column("group")) == {"0", "1", "2"}
+    near = np.round((time - 0.003) / 0.01) * 0.01 + 0.003
+    assert np.allclose(found, force(time if how == "linear" else near), atol=1e-6)
+    assert np.allclose(abs(found - force(time)).max(), 0 if how == "linear" else 0.009, atol=1e-6)
+    assert (pack.column("label_kind") == (near >= 1)).all()  # a class is never between two others
+    for i in range(pack.num):
+        frame = shade(int(pack.column("frame")[i]), int(pack.column("recording")[i]))
+        assert abs(pack.images["touch"][i].mean() - frame) < 6
+    assert "force.csv joined by stamp, its largest gap is 0.01 s" in pack.spec.notes
+
+
+def test_nothing_is_extrapolated_and_what_is_left_out_is_counted(tmp_path: Path) -> None:
+    root = recorded(tmp_path / "set", ends=(0.5, 1.5))
+    lines = (root / "0/force.csv").read_text().splitlines()
+    (root / "0/force.csv").write_text("\n".join(lines[:40] + lines[60:]))  # no measurement from .893 to 1.093 s
+    pack = packed(root, tmp_path / "p", **LOG)
+    time, own = pack.column("time").astype(float), pack.column("recording")
+    assert time.min() >= 0.503 and time.max() <= 1.493
+    assert not ((time > 0.893) & (time < 1.093) & (own == "0")).any()
+    assert ((time > 0.893) & (time < 1.093) & (own == "1")).sum() == 5
+    (note,) = pack.spec.notes
+    assert re.fullmatch(
+        r"force\.csv joined by stamp, its largest gap is 0\.21 s; (\d+) of 150 rows are not .*", note
+    ) and f"; {150 - pack.num} of" in note  # fmt: skip
+    wide = packed(root, tmp_path / "w", **LOG, tolerance=0.2)
+    inside = (wide.column("time").astype(float) > 0.893) & (wide.column("time").astype(float) < 1.093)
+    assert inside.sum() == 15 and np.allclose(
+        wide.values(wide.spec.values[0])[:, 0], force(wide.column("time").astype(float)), atol=1e-6
+    )
+
+
+def test_a_clock_that_is_off_is_named_and_set_right(tmp_path: Path) -> None:
+    root = recorded(tmp_path / "set", shift=START)
+    with pytest.raises(
+        ValueError, match=r"force\.csv has no time of the images, 0\.000 to 1\.960 s, but 1699999999\.9"
+    ):
+        packed(root, tmp_path / "no", **LOG)
+    pack = packed(root, tmp_path / "p", **{**LOG, "log": (f"force.csv:stamp-{START:.0f}",)})
+    assert np.allclose(pack.values(pack.spec.values[0])[:, 0], force(pack.column("time").astype(float)), atol=1e-4)
+
+
+def test_times_of_frames_may_stand_beside_the_video(tmp_path: Path) -> None:
+    """One log for all, in ns since 1970, and the times of the frames in a file, in other words as dates."""
+    times = START + 0.05 * np.arange(50)
+    for k, name in enumerate(("a", "b")):
+        film(tmp_path / f"set/{name}.mp4", 50, which=k)
+    dates = [str(np.datetime64(round(t * 1e6), "us")) + "+00:00" for t in times]
+    write_csv(tmp_path / "set/a_timestamps.csv", stamp=dates)
+    (tmp_path / "set/b_timestamps.txt").write_text("\n".join(f"{t + 5:.3f}" for t in times))
+    log = START + np.arange(-1, 9, 0.01)
+    write_csv(tmp_path / "logs.csv", ns=(log * 1e9).astype(int), Fz=force(log - START))
+    pack = packed(tmp_path / "set", tmp_path / "p", log=("../logs.csv:ns",), values=("Fz:N",))
+    frame, late = pack.column("frame").astype(int), 5 * (pack.column("recording") == "b")
+    assert pack.num == 20 and np.allclose(pack.values(pack.spec.values[0])[:, 0], force(0.05 * frame + late), atol=1e-3)
+    (tmp_path / "set/b_timestamps.txt").write_text("1\n2")
+    with pytest.raises(ValueError, match=r"b_timestamps\.txt has 2 times, b\.mp4 has 50 frames"):
+        packed(tmp_path / "set", tmp_path / "no")
+
+
+def test_two_cameras_out_of_step_are_paired_by_time(tmp_path: Path) -> None:
+    for k in range(3):
+        film(tmp_path / f"set/{k}/gel.mp4", 50, which=k, rate=25)
+        film(tmp_path / f"set/{k}/camera.mp4", 18, which=k + 1, rate=10)
+    names: dict[str, Any] = {"touch": ("gel",), "vision": "camera", "every": 2}
+    pack = packed(tmp_path / "set", tmp_path / "p", tolerance=0.05, **names)
+    time, which = pack.column("time").astype(float), pack.column("recording")
+    for i in range(pack.num):
+        k = int(which[i][0])
+        assert abs(pack.images["touch"][i].mean() - shade(round(25 * time[i]), k)) < 6
+        nearest = min(range(18), key=lambda frame: abs(frame / 10 - time[i]))
+        assert abs(nearest / 10 - time[i]) <= 0.05 and abs(pack.images["vision"][i].mean() - shade(nearest, k + 1)) < 6
+    assert "gel and camera are paired by time, at most 0.04 s apart; 9 frames without a partner" in pack.spec.notes[0]
+    assert pack.num == 3 * 22
+
+
+def test_a_list_of_another_camera_is_a_log(tmp_path: Path) -> None:
+    def pictures(folder: str, times: np.ndarray) -> dict[str, Any]:
+        for i in range(len(times)):
+            path = tmp_path / folder / f"{i}.png"
+            path.parent.mkdir(exist_ok=True)
+            Image.new("RGB", (16, 16), (5 * i, 0, 0)).save(path)
+        return {"time": times}
+
+    touch = pictures("gel", np.arange(30) / 30)
+    seen = pictures("cam", np.arange(15) / 15 + 0.01)
+    write_csv(
+        tmp_path / "gel/list.csv", touch=[f"{i}.png" for i in range(30)], **touch, take=[i // 10 for i in range(30)]
+    )
+    write_csv(tmp_path / "cam/list.csv", vision=[f"{i}.png" for i in range(15)], time=seen["time"])
+    pack = packed(
+        tmp_path / "gel/list.csv", tmp_path / "p", group="take", log=("../cam/list.csv:time",), tolerance=0.03
+    )
+    red = {m: pack.images[m][:, 0, 0, 0].astype(int) // 5 for m in ("touch", "vision")}
+    assert pack.num == 30 and (abs(red["touch"] / 30 - red["vision"] / 15 - 0.01) <= 0.03).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"log": ("force.csv",)}, r"log 'force\.csv': write FILE:COLUMN"),
+        ({"log": ("force.csv:time",)}, r"unknown column 'time': choose from stamp, Fz, kind"),
+        ({"log": ("none.csv:stamp",)}, r"none\.csv cannot be read as a table"),
+        ({"log": ("force.csv:stamp", "force.csv:stamp")}, r"both have a column 'Fz': rename one"),
+        ({"tolerance": -1.0}, r"tolerance -1\.0: give 0 or more"),
+    ],
+)
+def test_logs_that_cannot_be_joined(tmp_path: Path, options: dict[str, Any], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        packed(recorded(tmp_path / "set", num=1), tmp_path / "p", **{**LOG, **options})
+
+
+def test_stamps_are_seconds_whatever_their_unit() -> None:
+    times = START + np.array([0.25, 3.5])
+    for scale in (1, 1e3, 1e6, 1e9):
+        assert np.allclose(seconds([f"{t * scale:.0f}" if scale > 1 else str(t) for t in times]), times, atol=1e-3)
+    assert np.isnan(seconds(["", "1"])[0]) and seconds(["1.5"])[0] == 1.5
+
+
+def test_videos_without_labels_are_data(tmp_path: Path) -> None:
+    """All to train on but a little val: of few videos their ends, of many every tenth."""
+    for k in range(3):
+        film(tmp_path / f"few/{k}.mp4", 50, which=k)
+    pack = packed(tmp_path / "few", tmp_path / "p")
+    split, frame, group = pack.column("split"), pack.column("frame").astype(int), pack.column("group")
+    assert pack.num == 30 and not pack.spec.all_tasks and set(frame) == set(range(0, 50, 5))
+    assert ((split == "val") == (frame == 45)).all() and set(split) == {"train", "val"}
+    assert not set(group[split == "val"]) & set(group[split == "train"])
+    for k in range(20):
+        film(tmp_path / f"many/{k:02d}.mp4", 6)
+    pack = packed(tmp_path / "many", tmp_path / "q", pictures="vision", every=3)
+    assert pack.spec.modalities == ("vision",) and pack.num == 40
+    assert set(pack.column("group")[pack.column("split") == "val"]) == {"09", "19"}
+
+
+def test_images_without_labels_are_one_recording(tmp_path: Path) -> None:
+    for i in range(20):
+        Image.new("RGB", (16, 16), (10 * i, 0, 0)).save(
+            (tmp_path / "digit").mkdir(exist_ok=True) or tmp_path / f"digit/{i}.png"
+        )
+    pack = packed(tmp_path / "digit", tmp_path / "p")
+    assert pack.images["touch"][:, 0, 0, 0].tolist() == [10 * i for i in range(20)]  # 2 before 10
+    assert pack.column("split").tolist() == ["train"] * 18 + ["val"] * 2 and "time" not in pack.table.column_names
+    for i in range(20):
+        (tmp_path / f"digit/{i}.png").rename(tmp_path / f"digit/{START + i / 10:.1f}.png")
+    times = START + np.arange(-1, 4, 0.05)
+    write_csv(tmp_path / "force.csv", t=times, Fz=force(times - START))
+    joined = packed(tmp_path / "digit", tmp_path / "q", log=("../force.csv:t",), only=("Fz>=2.5",), every=1)
+    assert joined.images["touch"][:, 0, 0, 0].tolist() == [10 * i for i in range(5, 20)]
