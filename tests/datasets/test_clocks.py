@@ -11,10 +11,11 @@ import pytest
 from PIL import Image
 
 from mvitac.data.build import build
+from mvitac.data.checks.examine import examine_source
 from mvitac.data.pack import Pack
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.table.clocks import seconds
-from support.films import film, shade
+from support.videos import film, shade, write_video
 
 START = 1_700_000_000.0
 
@@ -199,3 +200,39 @@ def test_images_without_labels_are_one_recording(tmp_path: Path) -> None:
     write_csv(tmp_path / "force.csv", t=times, Fz=force(times - START))
     joined = packed(tmp_path / "digit", tmp_path / "q", log=("../force.csv:t",), only=("Fz>=2.5",), every=1)
     assert joined.images["touch"][:, 0, 0, 0].tolist() == [10 * i for i in range(5, 20)]
+
+
+def pressing(root: Path, num: int, seconds: float) -> Path:
+    """Videos at 25 Hz of a gel with presses at random times, and the force (the depth squared, and noise) at 100 Hz."""
+    rng = np.random.default_rng(0)
+    x, y = np.meshgrid(np.linspace(-1, 1, 64), np.linspace(-1, 1, 48))
+    for k in range(num):
+        middles = np.arange(0.8, seconds, 1.4) + rng.uniform(-0.4, 0.4, len(np.arange(0.8, seconds, 1.4)))
+        depth = lambda t, m=middles: np.exp(-(((t[:, None] - m) / 0.25) ** 2)).max(1)  # noqa: E731
+        shown = depth(np.arange(round(25 * seconds)) / 25)
+        place = rng.uniform(-0.5, 0.5, 2)
+
+        def frame(i: int, shown: np.ndarray = shown, place: np.ndarray = place) -> np.ndarray:
+            mark = 120 * shown[i] * np.exp(-((x - place[0]) ** 2 + (y - place[1]) ** 2) / 0.1)
+            noise = np.random.default_rng(i).normal(0, 3, (48, 64))
+            return np.repeat((90 + mark + noise).clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+        write_video(root / f"{k}/gel.mp4", len(shown), frame, rate=25)
+        times = np.arange(-1, seconds + 1, 0.01)
+        write_csv(root / f"{k}/force.csv", stamp=times, Fz=8 * depth(times) ** 2 + rng.normal(0, 0.1, len(times)))
+    return root
+
+
+@pytest.mark.parametrize(("num", "seconds", "every"), [(6, 3.0, 1), (6, 9.0, 5), (3, 30.0, 2)])
+def test_the_check_finds_a_shift_and_its_size(tmp_path: Path, num: int, seconds: float, every: int) -> None:
+    root = pressing(tmp_path / "set", num, seconds)
+    for shift in (0.0, 0.5, -0.5):
+        log = {"log": (f"force.csv:stamp{shift:+}",), "every": every, "tolerance": 0.05}
+        config = FolderConfig(path=root, size=32, test_share=0.4, **{**LOG, **log})
+        findings = examine_source(config.source(), size=32, quiet=True)
+        (found,) = [one for one in findings if one.item == "time shift between images and values"]
+        assert found.verdict == ("look" if shift else "ok"), found
+        if shift:
+            told = re.search(r"values come [\d.]+ rows \(([\d.]+) s\) (late|early)", found.evidence)
+            assert told and told[2] == ("late" if shift > 0 else "early")
+            assert abs(float(told[1]) - 0.5) <= max(0.04, every / 50 + 0.001), found

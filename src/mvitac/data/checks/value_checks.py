@@ -5,13 +5,18 @@ import re
 import numpy as np
 
 from mvitac.data.checks.finding import Finding, judged, share, some
+from mvitac.data.checks.image_stats import ImageStats
 from mvitac.data.pack import Pack
-from mvitac.data.spec import Target, ValueTask, Window
+from mvitac.data.spec import STAMPS, Target, ValueTask, Window
 from mvitac.data.windows import frames_of, places, recordings
 
 UNITS = ("N", "mN", "kN", "m", "cm", "mm", "um", "deg", "rad", "s", "ms", "kg", "g", "Nm", "Pa", "kPa")
 """Units whose name at the end of a column's name, as in depth_mm, is taken for the unit of the column."""
 STUCK_FRAMES = 10  # shortest constant stretch that is reported
+BLOCK = 240  # rows of a long recording in which one shift is looked for, up to a third of them
+CLEAR, GAIN, SHIFTED = 0.7, 0.05, 1 / 3
+"""A block knows its shift if it correlates so much at some lag, and is shifted if that is so much more than at none. It is
+reported if more than this share of them is (measured on the 33 grasps of docs/values.md)."""
 
 
 def values(pack: Pack) -> list[Finding]:
@@ -119,6 +124,65 @@ def _outside(found: np.ndarray, measured: dict[str, np.ndarray], target: Target)
         return "", []
     text = f"{share(len(beyond), len(test))} test rows are outside train ({train.min():.4g} to {train.max():.4g}"
     return f"{text} {target.unit})", beyond.tolist()
+
+
+def time_shift(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
+    """Find values that are late or early: |frame - first frame| of a touch, correlated with each value by lag."""
+    item = "time shift between images and values"
+    if not pack.spec.values or not (touches := _touches(pack)):
+        return Finding(item, "not checkable", "no values, or no column that orders rows")
+    modality = pack.spec.modalities[-1]
+    change = np.zeros(pack.num)
+    for light in (look.light for look in looks.values() if look.modality == modality):
+        for rows in touches:
+            change[rows] += abs(light[rows] - light[rows[0]]).mean((1, 2))
+    change[~pack.has(modality)] = np.nan
+    clock = next((pack.column(name).astype(float) for name in STAMPS if name in pack.table.column_names), None)
+    notes, suspects = [], []
+    for task in pack.spec.values:
+        for t, target in enumerate(task.targets):
+            found = [_shift(change, pack.values(task)[:, t], block) for rows in touches for block in _blocks(rows)]
+            sign = np.sign(sum(curve[abs(curve).argmax()] for _, curve in found)) or 1.0
+            known = [(rows, sign * curve) for rows, curve in found if len(curve) and (sign * curve).max() >= CLEAR]
+            late = [(rows, _lag(c)) for rows, c in known if c.max() - c[len(c) // 2] > GAIN]
+            if not known:
+                continue
+            lag = float(np.median([lag for _, lag in late])) if late else 0
+            note = f"{target.name}: {len(late)} of {len(known)} sequences fit better shifted"
+            if len(late) > SHIFTED * len(known):
+                steps = [np.median(np.diff(clock[rows])) for rows, _ in late] if clock is not None else [np.nan]
+                time = f" ({abs(lag) * np.median(steps):.2g} s)" * bool(np.isfinite(steps).all())
+                spread = [lag for _, lag in late]
+                note += f", where values come {abs(lag):g} rows{time} {'late' if lag > 0 else 'early'}"
+                note += f" (median; {min(spread)} to {max(spread)})"
+                suspects += [int(rows[0]) for rows, _ in late]
+            notes.append(note)
+    if not notes:
+        return Finding(item, "not checkable", f"no value follows |frame - first frame| of {modality}")
+    advice = "join by better time stamps, or shift the log: --log FILE:COLUMN-SECONDS if it is late, +SECONDS if early"
+    return judged(item, "; ".join(notes), advice, suspects, look=bool(suspects))
+
+
+def _blocks(rows: np.ndarray) -> list[np.ndarray]:
+    return np.array_split(rows, -(-len(rows) // BLOCK))
+
+
+def _lag(curve: np.ndarray) -> int:
+    """Return the smallest lag with a peak as high as any: regular presses fit again one press later."""
+    peak = (curve >= np.r_[-1, curve[:-1]]) & (curve >= np.r_[curve[1:], -1])
+    lags = np.flatnonzero(peak & (curve >= curve.max() - 0.02)) - len(curve) // 2
+    return int(lags[abs(lags).argmin()])
+
+
+def _shift(change: np.ndarray, value: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``rows`` and the correlation of ``change`` with a ``value`` that is k rows late, k from -L to L."""
+    longest, curve = len(rows) // 3, []
+    for lag in range(-longest, longest + 1):
+        a, b = change[rows[max(0, -lag) : len(rows) - max(0, lag)]], value[rows[max(0, lag) : len(rows) + min(0, lag)]]
+        both = np.isfinite(a) & np.isfinite(b)
+        still = both.sum() < 8 or min(np.ptp(a[both]), np.ptp(b[both])) < 1e-6
+        curve.append(0.0 if still else np.corrcoef(a[both], b[both])[0, 1])
+    return rows, np.array(curve)
 
 
 def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
