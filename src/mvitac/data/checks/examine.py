@@ -86,7 +86,7 @@ def examine(
         image_checks.red_and_blue(pack, looks),
         image_checks.swapped_modalities(pack, looks),
         image_checks.time_offset(pack, looks),
-        value_checks.time_shift(pack, looks),
+        *([value_checks.time_shift(pack, looks)] if pack.spec.values else []),
         table_checks.mixture(pack),
         *labels,
         *table_checks.ungrouped(pack),
