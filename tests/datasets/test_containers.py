@@ -89,6 +89,38 @@ def make_lerobot(root: Path, *, gel_rate: int = 10, version: str = "v3.0") -> Pa
     return root
 
 
+def test_lerobot_of_version_2_has_a_file_per_episode(tmp_path: Path) -> None:
+    """The layout that lerobot 0.3.3 wrote."""
+    root, features = tmp_path / "set", {FRONT: "video", GEL: "video", "force": "float32", "task_index": "int64"}
+    info = {
+        "codebase_version": "v2.1",
+        "chunks_size": 2,
+        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+        "video_path": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
+        "features": {name: {"dtype": kind, "shape": [1]} for name, kind in features.items()},
+    }
+    (root / "meta").mkdir(parents=True)
+    (root / "meta/info.json").write_text(json.dumps(info))
+    tasks = [json.dumps({"task_index": k, "task": name}) for k, name in enumerate(("press", "slide"))]
+    (root / "meta/tasks.jsonl").write_text("\n".join(tasks))
+    for e in range(4):
+        chunk, name = f"chunk-{e // 2:03d}", f"episode_{e:06d}"
+        for which, key in enumerate((FRONT, GEL)):
+            film(root / f"videos/{chunk}/{key}/{name}.mp4", 8, which=e + which, rate=10)
+        known = {"episode_index": e, "task_index": e % 2}
+        rows = [{"timestamp": i / 10, "frame_index": i, "index": 8 * e + i, "force": i / 2, **known} for i in range(8)]
+        (root / f"data/{chunk}").mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.Table.from_pylist(rows), root / f"data/{chunk}/{name}.parquet")
+    pack = packed(LeRobotConfig(path=root, size=16, labels=("task",), values=("force:N",)), tmp_path / "pack")
+    episode, frame = pack.column("episode").astype(int), pack.column("frame").astype(int)
+    assert pack.num == 32 and (pack.values(pack.spec.values[0])[:, 0] == frame / 2).all()
+    named = [pack.spec.tasks[0].classes[k] for k in pack.column("label_task")]
+    assert named == [("press", "slide")[e % 2] for e in episode]
+    for i in range(32):
+        assert abs(level(pack.images["vision"][i]) - shade(frame[i], episode[i])) < 6
+        assert abs(level(pack.images["touch"][i]) - shade(frame[i], episode[i] + 1)) < 6
+
+
 @pytest.mark.parametrize("gel_rate", [10, 30])
 def test_lerobot_pairs_by_time(tmp_path: Path, gel_rate: int) -> None:
     root = make_lerobot(tmp_path / "set", gel_rate=gel_rate)
@@ -167,7 +199,7 @@ def test_lerobot_says_what_is_missing(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
 
     refused(tmp_path / "nowhere", r"info\.json does not exist")
-    refused(make_lerobot(tmp_path / "old", version="v2.1"), r"version v2\.1, this reads v3\.0: convert it")
+    refused(make_lerobot(tmp_path / "old", version="v1.6"), r"version v1\.6: v2\.0 to v3\.0 are read")
     root = make_lerobot(tmp_path / "set")
     (root / f"videos/{GEL}/chunk-000/file-001.mp4").unlink()
     refused(root, r"file-001\.mp4 is missing: fetch the videos too")

@@ -419,7 +419,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "broken png": (damage_png, "cannot"),
     "animation": (damage_frames, "2 frames"),
     "float": (lambda path: Image.fromarray(np.ones((8, 8), np.float32)).save(path, "TIFF"), "floating-point"),
-    "32 bit": (lambda path: Image.fromarray(np.full((8, 8), 70000, np.int32)).save(path, "TIFF"), "16 bits"),
+    "32 bit": (lambda path: Image.fromarray(np.full((8, 8), 70000, np.int32)).save(path, "TIFF"), "not 0 to 65535"),
     "other size": (lambda path: Image.new("RGB", (9, 9)).save(path), "one size"),
     "gone": (lambda path: path.unlink(), "does not exist"),
 }
@@ -661,15 +661,16 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
         write(rows, tmp_path / f"manifest.{suffix}")
     refused(tmp_path, "manifest.csv and manifest.jsonl")
     (tmp_path / "bare").mkdir()
-    refused(tmp_path / "bare", "holds no manifest, HDF5 file or class folders")
+    refused(tmp_path / "bare", "holds no manifest, HDF5 file, videos or images")
     (tmp_path / "empty/vision").mkdir(parents=True)
-    refused(tmp_path / "empty", "class folders with images")
+    refused(tmp_path / "empty", "HDF5 file, videos or images")
     lonely = tmp_path / "lonely"
     picture(lonely / "vision/a/1.png")
     picture(lonely / "touch/b/1.png")
     refused(lonely, r"row 2 \(touch/b/1\.png\) has no vision path: .*allow-missing")
-    picture(tmp_path / "flat/touch/1.png")
-    refused(tmp_path / "flat", "not in a class folder")
+    for name in ("1", "a/2"):
+        picture(tmp_path / f"half flat/touch/{name}.png")
+    refused(tmp_path / "half flat", r"1\.\* is not in a class folder")
     for suffix in ("png", "bmp"):
         picture(tmp_path / f"twins/touch/a/1.{suffix}")
     refused(tmp_path / "twins", "differ in their suffix only")

@@ -2,6 +2,7 @@
 
 import re
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -34,12 +35,13 @@ FORMATS = ("JPEG", "PNG", "BMP", "TIFF", "WEBP", "PPM", "GIF")
 """What a file is read as, whatever its name (JPEG: a camera's MPO, too). Pillow would start Ghostscript for an EPS."""
 
 
-def decode(path: str | Path | BinaryIO, name: str = "") -> Image.Image:
+def decode(path: str | Path | BinaryIO, name: str = "", span: Sequence[float] = ()) -> Image.Image:
     """Read an image file as RGB: rotated by EXIF, 16 bits scaled to 8, transparent parts black.
 
     Packs, ``find``, ``live FOLDER`` and the explorer all read files with it; ``Model.embed`` treats PIL images alike.
 
-    ``name`` is the name of an open file in error messages.
+    ``name`` is the name of an open file in error messages; ``span`` are the numbers of 16 bits or floats that become
+    black and white, by default 0 and 65535.
     """
     name = name or str(path)
     try:
@@ -52,7 +54,7 @@ def decode(path: str | Path | BinaryIO, name: str = "") -> Image.Image:
             if image.format in ("JPEG", "MPO"):
                 return to_rgb(_jpeg(image))
             image.load()
-            return to_rgb(image)
+            return to_rgb(image, span)
     except FileNotFoundError:
         raise ValueError(f"{name} does not exist: an image is missing there") from None
     # PIL has no common base class for errors of damaged files.
@@ -85,18 +87,25 @@ def _jpeg(image: Image.Image) -> Image.Image:
     return found
 
 
-def to_rgb(image: Image.Image) -> Image.Image:
+def to_gray(values: np.ndarray, span: Sequence[float], clip: bool) -> np.ndarray:
+    """Scale numbers to uint8, so that ``span`` becomes 0 to 255; without ``clip``, others are a ValueError."""
+    low, high = span
+    least, most = float(values.min()), float(values.max())
+    if not np.isfinite(values).all() or (not clip and (least < low or most > high)):
+        raise ValueError(
+            f"its values lie in {least:g} to {most:g}, not {low:g} to {high:g}: --data.range COLUMN=LOW:HIGH"
+        )
+    return np.rint(np.clip((values - np.float64(low)) / (high - low), 0, 1) * 255).astype(np.uint8)
+
+
+def to_rgb(image: Image.Image, span: Sequence[float] = ()) -> Image.Image:
     """An opened image as RGB, by the rules of ``decode``; ``image`` itself is not changed. Raises as ``decode``."""
     if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
         image = ImageOps.exif_transpose(image)
-    if image.mode.startswith("I"):
-        values = np.asarray(image).astype(np.int64)
-        if values.min() < 0 or values.max() > 65535:
-            raise ValueError(f"its values lie in {values.min()} to {values.max()}, not in 16 bits: scale it first")
-        gray = ((values + 128) // 257).astype(np.uint8)  # 65535 -> 255; PIL's own conversion clips instead
-        return Image.fromarray(gray).convert("RGB")
-    if image.mode == "F":
-        raise ValueError("it holds floating-point values of unknown range: store it with 8 or 16 bits")
+    if image.mode.startswith("I") or image.mode == "F":  # PIL's own conversion clips instead
+        if image.mode == "F" and not span:
+            raise ValueError("it holds floating-point values of unknown range: --data.range COLUMN=LOW:HIGH")
+        return Image.fromarray(to_gray(np.asarray(image), span or (0, 65535), bool(span))).convert("RGB")
     if image.mode in ("LA", "La", "PA", "RGBA", "RGBa") or "transparency" in image.info:
         image = image.convert("RGBA")
         black = Image.new("RGBA", image.size, (0, 0, 0, 255))

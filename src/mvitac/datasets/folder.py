@@ -24,9 +24,10 @@ A path may be a **video**; column ``frame`` (or ``touch_frame``, ``vision_frame`
     <root>/gel_timestamps.csv, .txt             the time of each frame of gel.mp4, if the container's is not right
     <root>/<number>.jpg                         one recording of one camera; a number of seconds since 1970 is its time
 
-An **HDF5 file** (.h5, .hdf5), or a folder of them, holds images and numbers as datasets with one row per frame
-(``mvitac.datasets.table.hdf5``); ``vision`` and ``touch`` name image datasets:
+An **HDF5 or zarr file** (.h5, .hdf5, .zarr, .zarr.zip), or a folder of them, has datasets with one row per frame
+(``mvitac.datasets.table.arrays``); ``vision`` and ``touch`` name image datasets:
 
+    buffer.zarr  data/camera  data/gel  data/action  meta/episode_ends       a replay buffer; also .zarr.zip
     grips.h5     camera uint8 [N, H, W, 3]    gel uint8 [N, H, W, 3]    force_n [N]    pose [N, 6]    object [N]
     demos.h5     data/demo_0/obs/camera       data/demo_0/obs/gel       data/demo_0/force             one group each
 
@@ -41,9 +42,9 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from mvitac.data.video import VIDEOS
+from mvitac.datasets.table.arrays import read_arrays
 from mvitac.datasets.table.folders import list_images, list_videos, to_train
-from mvitac.datasets.table.hdf5 import read_hdf5
-from mvitac.datasets.table.image_refs import HDF5
+from mvitac.datasets.table.image_refs import ARRAYS
 from mvitac.datasets.table.manifest import READERS, Manifest, read_manifest
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.registry import check_range
@@ -56,8 +57,8 @@ class FolderConfig(RowsConfig):
     name: ClassVar[str] = "folder"
 
     path: Path = Path("data")
-    """A manifest (.csv, .parquet, .jsonl), an HDF5 file, a video, or a folder with manifest.*, of HDF5 files, of videos,
-    of class folders or of images."""
+    """A manifest (.csv, .parquet, .jsonl), an HDF5 or zarr file, a video; or a folder with manifest.*, of HDF5 or zarr
+    files, of videos, of class folders or of images."""
     pictures: Literal["touch", "vision"] = "touch"
     """Modality of images and videos that nothing names (<root>/<class>/*.jpg, <root>/*.mp4)."""
 
@@ -70,21 +71,22 @@ class FolderConfig(RowsConfig):
             check_range(self, 1, math.inf, "every")
 
     def manifest(self) -> Manifest:
-        files = sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
         if not self.path.exists():
             raise ValueError(f"{self.path} does not exist: give a manifest, an HDF5 file or a folder as --data.path")
+        alone = not self.path.is_dir() or self.path.name.lower().endswith(ARRAYS)
+        files = [self.path] if alone else sorted(self.path.iterdir())
         tables = [f for f in files if f.suffix.lower() in READERS and (f == self.path or f.stem == "manifest")]
         if len(tables) > 1:
             raise ValueError(f"{self.path} holds {' and '.join(f.name for f in tables)}: give the path of one of them")
         if tables:
             return read_manifest(tables[0])
-        if arrays := [file for file in files if file.suffix.lower() in HDF5 and file.is_file()]:
+        if arrays := [file for file in files if file.name.lower().endswith(ARRAYS)]:
             images = [name for name in (self.vision, *self.touch, *self.background) if name]
-            return read_hdf5(self.path, arrays, images, self.vectors())
+            return read_arrays(self.path, arrays, images, self.vectors())
         cameras = [name for name in (*self.touch, self.vision) if name]
         found = list_videos(self.path, cameras, self.pictures, self.every, self.tolerance)
         if not found and not self.path.is_dir():
-            raise ValueError(f"{self.path} is no table: its name must end in {', '.join((*READERS, *HDF5, *VIDEOS))}")
+            raise ValueError(f"{self.path} is no table: its name must end in {', '.join((*READERS, *ARRAYS, *VIDEOS))}")
         found = found or list_images(self.path, self.pictures, self.every)
         return found if self.labels or self.values else to_train(found)
 

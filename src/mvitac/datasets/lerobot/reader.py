@@ -1,4 +1,4 @@
-"""``--data lerobot``: a LeRobotDataset v3 folder (https://huggingface.co/docs/lerobot/lerobot-dataset-v3).
+"""``--data lerobot``: a LeRobotDataset folder, v3 (https://huggingface.co/docs/lerobot/lerobot-dataset-v3) or v2.
 
     meta/info.json                                   version, fps, path templates, features (dtype video, image, int64, ...)
     meta/tasks.parquet                               task text -> task_index
@@ -6,6 +6,9 @@
                                                      file_index, from_timestamp}: several episodes share one file
     data/chunk-000/file-000.parquet                  per frame: timestamp within its episode, episode_index, features
     videos/<camera key>/chunk-000/file-000.mp4
+
+Version 2 has a file per episode, data/chunk-000/episode_000000.parquet and videos/chunk-000/<camera key>/episode_000000.mp4,
+and meta/tasks.jsonl.
 
 A sample is a pair: both cameras at the time of a table row. From a video, the frame with the nearest presentation time is
 used, so cameras may have different rates. If it is farther away than ``tolerance``, the image is missing.
@@ -28,9 +31,8 @@ from mvitac.datasets.table.image_refs import Frame, ImageRef, ParquetCell
 from mvitac.datasets.table.manifest import Manifest, text_of
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.registry import check_range, unknown
-from mvitac.system.files import brief, read_json
+from mvitac.system.files import brief, parse_json, read_json
 
-VERSION = "v3.0"
 FELT = re.compile(r"touch|tactile|gelsight|digit(?!al)|gel\b|finger", re.IGNORECASE)  # usual names of tactile cameras
 RENAMED = {"episode_index": "episode", "frame_index": "frame", "index": "id"}
 """Columns of the format -> names in a pack."""
@@ -39,7 +41,7 @@ SCALARS = {"float16", "float32", "float64", "int8", "int16", "int32", "int64", "
 
 @dataclass(frozen=True, kw_only=True)
 class LeRobotConfig(RowsConfig):
-    """A LeRobotDataset v3 on disk: cameras as vision and touch, paired by time."""
+    """A LeRobotDataset (v3, v2) on disk: cameras as vision and touch, paired by time."""
 
     name: ClassVar[str] = "lerobot"
 
@@ -80,17 +82,21 @@ class LeRobotConfig(RowsConfig):
 
     def _in_videos(self, info: dict[str, Any], key: str, rows: Sequence[dict[str, str]]) -> list[ImageRef | None]:
         """Return the frame of camera ``key`` at each row's time; None if no frame is near enough."""
-        episodes = {str(e["episode_index"]): e for e in _tables(self.path, "meta/episodes", f"videos/{key}/")}
+        episodes = {}
+        if is_new := str(info["codebase_version"]).startswith("v3"):
+            episodes = {str(e["episode_index"]): e for e in _tables(self.path, "meta/episodes", f"videos/{key}/")}
         wanted: dict[str, list[int]] = {}
         for i, row in enumerate(rows):
             wanted.setdefault(row["episode"], []).append(i)
         times: dict[Path, np.ndarray] = {}
         places: list[ImageRef | None] = [None] * len(rows)
         for name, numbers in wanted.items():
-            episode = episodes.get(name)
-            if episode is None or episode.get(f"videos/{key}/from_timestamp") is None:
+            number = int(name)
+            episode = episodes.get(name, {}) if is_new else {f"videos/{key}/from_timestamp": 0.0}
+            if episode.get(f"videos/{key}/from_timestamp") is None:
                 raise ValueError(f"{self.path}: meta/episodes has no entry for {key} in episode {name}")
-            place = {part: episode[f"videos/{key}/{part}"] for part in ("chunk_index", "file_index")}
+            place = {part: episode.get(f"videos/{key}/{part}") for part in ("chunk_index", "file_index")}
+            place |= {"episode_index": number, "episode_chunk": number // info.get("chunks_size", 1000)}
             file = self.path / info["video_path"].format(video_key=key, **place)
             if file not in times:
                 if not file.is_file():
@@ -137,11 +143,8 @@ def choose(cameras: Sequence[str], vision: str | None, touch: tuple[str, ...], w
 def _info(root: Path) -> dict[str, Any]:
     info = read_json(root / "meta" / "info.json", "a LeRobotDataset's description")
     version = str(info.get("codebase_version")) if isinstance(info, dict) else "none"
-    if not version.startswith("v3"):
-        raise ValueError(
-            f"{root} has LeRobotDataset version {version}, this reads {VERSION}: convert it by"
-            " lerobot.datasets.v30.convert_dataset_v21_to_v30"
-        )
+    if not version.startswith(("v2", "v3")):
+        raise ValueError(f"{root} has LeRobotDataset version {version}: v2.0 to v3.0 are read")
     if not isinstance(info.get("features"), dict) or not all("dtype" in f for f in info["features"].values()):
         raise ValueError(f"{root / 'meta/info.json'} lists no features: fetch it again")
     return info
@@ -171,7 +174,9 @@ def _open(file: Path) -> pq.ParquetFile:
 
 
 def _tasks(root: Path) -> dict[int, str]:
-    file = root / "meta" / "tasks.parquet"
+    file, lines = root / "meta" / "tasks.parquet", root / "meta" / "tasks.jsonl"
+    if lines.is_file():
+        return {task["task_index"]: task["task"] for task in map(parse_json, lines.read_text().splitlines())}
     if not file.is_file():
         return {}
     table = _open(file).read()

@@ -99,7 +99,7 @@ def join(
             log.check(column)
             stamps = seconds([row[column] for row in log.rows]) + shift
             order = np.argsort(stamps, kind="stable")[: np.isfinite(stamps).sum()]  # NaN is last
-            cells, largest = _joined(log, order, stamps[order], times[at], (numbers if linear else ()), tolerance)
+            cells, largest = joined(log, order, stamps[order], times[at], (numbers if linear else ()), tolerance)
             gap = max(gap, largest)
             for i, row in zip(at, cells, strict=True):
                 made[i] = {c: cell for c, cell in row.items() if c != column}
@@ -134,7 +134,7 @@ def _files(table: Manifest, name: str, refs: Sequence[ImageRef | None]) -> dict[
     return files
 
 
-def _joined(
+def joined(
     log: Manifest, order: np.ndarray, stamps: np.ndarray, times: np.ndarray, smooth: Collection[str], tolerance: float
 ) -> tuple[list[dict[str, str]], float]:
     """Return the cells of ``log`` at ``times`` [M], {} where it has none, and its largest gap in seconds.

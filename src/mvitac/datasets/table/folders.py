@@ -69,7 +69,7 @@ def _split_rows(root: Path, split: str, plain: str, every: int) -> list[Row]:
         elif i % every:
             continue
         else:
-            row |= _frame(base.resolve().name, i, float(times[i]) if stamped else None)
+            row |= recording_row(base.resolve().name, i, float(times[i]) if stamped else None)
         rows.append({**row, **more})
     return rows
 
@@ -123,7 +123,7 @@ def list_videos(path: Path, names: Sequence[str], plain: str, every: int | None,
         alone += int((apart > tolerance).sum())
         for i in np.flatnonzero(apart <= tolerance):
             away = max(away, float(apart[i]))
-            rows.append(_frame(recording, int(shown[i]), float(own[shown[i]])))
+            rows.append(recording_row(recording, int(shown[i]), float(own[shown[i]])))
             for camera in cameras:
                 ref = Frame(str(files[camera]), int(at[camera][0][i])) if camera in files else None
                 images[camera].append(ref)
@@ -151,7 +151,7 @@ def _times(video: Path) -> np.ndarray:
     return stamps
 
 
-def _frame(recording: str, frame: int, time: float | None) -> Row:
+def recording_row(recording: str, frame: int, time: float | None) -> Row:
     row = {"id": f"{recording}/{frame:06d}", "recording": recording, "frame": str(frame)}
     return row if time is None else row | {"time": f"{time:.6f}", "minute": f"{recording}/{int(time // 60)}"}
 

@@ -4,6 +4,7 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from mvitac.data.source import Stamp, stamp_of
 from mvitac.datasets.table.image_refs import ImageRef
@@ -61,6 +62,12 @@ def backgrounds(
     return [known[name] for name in names]
 
 
+def folder_stamp(path: str) -> Stamp:
+    """Return the stamp of a folder: the size of its files, and when the last was written."""
+    found = [stamp_of(str(file)) for file in Path(path).rglob("*") if file.is_file()]
+    return sum(size for size, _ in found), max((time for _, time in found), default=0)
+
+
 def check_present(table: Manifest, by_modality: dict[str, Sequence[str]], allow_missing: bool) -> dict[str, list[bool]]:
     """Return, for each modality that some rows lack, which rows lack it; ValueError unless ``allow_missing``."""
     missing: dict[str, list[bool]] = {}
@@ -103,7 +110,7 @@ def check_files(
         named += [("background", ref) for refs in (grounds[i] if grounds else ()) for ref in refs]
         for column, ref in named:
             if ref.path not in stamps:
-                stamps[ref.path] = stamp_of(ref.path)
+                stamps[ref.path] = folder_stamp(ref.path) if ref.path.endswith(".zarr") else stamp_of(ref.path)
             sizes.append(stamps[ref.path][0])
             if sizes[-1] <= 0:
                 name = table.rows[i].get(column) or os.path.basename(ref.path)

@@ -1,4 +1,4 @@
-"""References to images: a file, a frame of a video, a member of a tar, a cell of a parquet table, a row of an HDF5 dataset.
+"""References to images: a file, a frame of a video, a member of a tar, a cell of a parquet table, an array.
 
 References with the same container (a video, a row group) are read together in one pass. Another format is one more
 class here: its ``container``, how it is ``opened``, and one ``image`` of it.
@@ -6,11 +6,12 @@ class here: its ``container``, how it is ``opened``, and one ``image`` of it.
 
 import io
 from collections.abc import Hashable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import pyarrow as pa
@@ -18,10 +19,10 @@ import pyarrow.parquet as pq
 from PIL import Image
 
 from mvitac.data import video
-from mvitac.data.images import decode
+from mvitac.data.images import decode, to_gray
 from mvitac.system.files import brief
 
-HDF5 = (".h5", ".hdf5")
+ARRAYS = (".h5", ".hdf5", ".zarr", ".zarr.zip")
 
 Damage = dict["ImageRef", str]  # reference of a damaged image -> what is wrong with it
 
@@ -31,6 +32,12 @@ class ImageRef:
     """One image of a dataset, here a file of its own; sorted and hashed by its location."""
 
     path: str
+    crop: tuple[int, ...] = field(default=(), kw_only=True)
+    """Left, top, width and height of the part that is used; () = all of it."""
+    span: tuple[float, ...] = field(default=(), kw_only=True)
+    """The numbers that become black and white, of images of more than 8 bits; () = 0 and 65535, or 0 and 1 of floats."""
+    bgr: bool = field(default=False, kw_only=True)
+    """Whether blue is stored first."""
 
     def __str__(self) -> str:
         return self.path
@@ -50,7 +57,9 @@ class ImageRef:
 
     def image(self, container: Any) -> Image.Image:
         """Read the image from the opened container as RGB; ValueError or OSError if it is damaged."""
-        return decode(self.path)
+        if self.path.lower().endswith(".npy"):
+            return picture(np.load(self.path, allow_pickle=False), self)
+        return decode(self.path, span=self.span)
 
     @staticmethod
     def read(refs: "Sequence[ImageRef]", lost: Damage) -> "Iterator[tuple[ImageRef, Image.Image]]":
@@ -139,27 +148,51 @@ class ParquetCell(ImageRef):
         return decode(io.BytesIO(value), str(self))
 
 
+def picture(pixels: Any, ref: ImageRef) -> Image.Image:
+    """Return an array as RGB: [H, W], or [H, W, 1 to 3] as numbers, or the bytes [B] of an image file."""
+    if isinstance(pixels, bytes) or pixels.ndim < 2:
+        return decode(io.BytesIO(pixels if isinstance(pixels, bytes) else pixels.tobytes()), str(ref))
+    if pixels.ndim > 3 or pixels.shape[2:] not in ((), (1,), (2,), (3,)):
+        raise ValueError(f"{ref} has the shape {list(pixels.shape)}: give height, width and 1 to 3 channels")
+    if pixels.dtype != np.uint8 or ref.span:
+        pixels = to_gray(pixels, ref.span or ((0, 65535) if pixels.dtype.kind in "iu" else (0.0, 1.0)), bool(ref.span))
+    pixels = pixels.reshape(*pixels.shape[:2], -1)
+    if pixels.shape[2] == 2:  # such as a field of motion
+        pixels = np.concatenate([pixels, np.zeros_like(pixels[:, :, :1])], axis=2)
+    return Image.fromarray(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels).convert("RGB")
+
+
 CHUNK_BYTES = 64 << 20
 """Cache for chunks of an HDF5 dataset. h5py's 1 MB is less than a chunk of several images, which each image would read."""
 
 
 @contextmanager
-def open_hdf5(path: str | Path) -> Iterator[Any]:
-    """Open an HDF5 file (h5py.File) for reading; ValueError if it, or something in it, is damaged."""
-    import h5py
-
+def open_arrays(path: str | Path) -> Iterator[Any]:
+    """Open an HDF5 file (h5py.File) or a zarr group for reading; ValueError if it, or something in it, is damaged."""
+    hdf5 = str(path).lower().endswith(ARRAYS[:2])
     try:
-        with h5py.File(path, rdcc_nbytes=CHUNK_BYTES) as file:
-            yield file
-    except (OSError, KeyError, RuntimeError, TypeError, UnicodeDecodeError) as error:  # h5py raises these
+        if hdf5:
+            import h5py
+
+            with h5py.File(path, rdcc_nbytes=CHUNK_BYTES) as file:
+                yield file
+        else:
+            import zarr
+
+            zipped = str(path).lower().endswith(".zip")
+            yield zarr.open_group(zarr.storage.ZipStore(path, mode="r") if zipped else str(path), mode="r")
+    except ModuleNotFoundError:
+        raise ValueError(f"{path} needs zarr: pip install 'mvitac[zarr]'") from None
+    except (OSError, KeyError, RuntimeError, TypeError, UnicodeDecodeError, BadZipFile) as error:
+        what = "HDF5" if hdf5 else "zarr"
         raise ValueError(
-            f"{path} cannot be read as HDF5 ({brief(error)}): is it complete, and closed by the program that wrote it?"
+            f"{path} cannot be read as {what} ({brief(error)}): is it complete, and closed by the program that wrote it?"
         ) from None
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Hdf5Row(ImageRef):
-    """Row ``index`` (from 0) of a ``dataset`` of an HDF5 file: uint8 [rows, height, width, 1 or 3]."""
+class ArrayRow(ImageRef):
+    """Row ``index`` (from 0) of a ``dataset`` of an HDF5 or zarr file: an image as numbers, or the bytes of a file."""
 
     dataset: str
     index: int
@@ -172,21 +205,52 @@ class Hdf5Row(ImageRef):
 
     @contextmanager
     def opened(self) -> Iterator[Any]:
-        with open_hdf5(self.path) as file:
+        with open_arrays(self.path) as file:
             yield file[self.dataset]
 
     def image(self, container: Any) -> Image.Image:
         try:
-            pixels = container[self.index]
+            found = container[self.index]
         except (OSError, RuntimeError, IndexError) as error:
             raise ValueError(f"{self} cannot be read ({brief(error)})") from None
-        return Image.fromarray(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels).convert("RGB")
+        return picture(found if isinstance(found, bytes) else as_array(found), self)
+
+
+def is_deep(ref: ImageRef) -> bool:
+    """Whether an image has more than 8 bits, so that it is scaled."""
+    if isinstance(ref, ArrayRow):
+        with ref.opened() as data:
+            return data.dtype != np.uint8 and data.ndim == 4
+    suffix = Path(ref.path).suffix.lower()
+    if suffix == ".npy":
+        return np.load(ref.path, mmap_mode="r").dtype != np.uint8
+    if type(ref) is not ImageRef or suffix not in (".png", ".tif", ".tiff", ".pgm"):
+        return False
+    with suppress(OSError), Image.open(ref.path) as image:
+        return image.mode[0] in "IF"
+    return False
+
+
+def as_array(found: Any) -> Any:
+    """Return what an array of bytes holds as bytes, and any other as an array of numbers."""
+    array = np.asarray(found)
+    return array.tolist() if array.dtype.kind in "SVO" and array.ndim == 0 else array
 
 
 def read_all(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
     """Yield each distinct reference, all of one container, with its image (RGB); damaged ones are put in ``lost``."""
     if distinct := sorted(set(refs)):
-        yield from distinct[0].read(distinct, lost)
+        for ref, image in distinct[0].read(distinct, lost):
+            yield ref, _prepared(ref, image)
+
+
+def _prepared(ref: ImageRef, image: Image.Image) -> Image.Image:
+    if ref.crop:
+        left, top, width, height = ref.crop
+        if left + width > image.width or top + height > image.height:
+            raise ValueError(f"{ref} is {image.width} x {image.height}: crop {':'.join(map(str, ref.crop))} is larger")
+        image = image.crop((left, top, left + width, top + height))
+    return Image.merge("RGB", image.split()[::-1]) if ref.bgr else image
 
 
 @lru_cache(maxsize=64)

@@ -9,7 +9,7 @@ import re
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,7 +21,8 @@ from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.datasets.table import clocks, columns, image_columns, splits
 from mvitac.datasets.table.columns import Condition, all_hold, value_task
 from mvitac.datasets.table.image_columns import Background
-from mvitac.datasets.table.manifest import Manifest
+from mvitac.datasets.table.image_refs import is_deep
+from mvitac.datasets.table.manifest import Manifest, number_of
 from mvitac.datasets.table.read_rows import Row, bundles, read_rows
 from mvitac.datasets.table.splits import BY_GROUP
 from mvitac.registry import check_range, to_json
@@ -95,6 +96,14 @@ class RowsConfig(DatasetConfig, ABC):
     """Largest distance in seconds of a row from a measurement of its logs, or a frame of its other cameras."""
     interpolate: Literal["linear", "nearest"] = "linear"
     """How the numbers of values are taken from logs. Other columns are of the nearest time."""
+    crop: tuple[str, ...] = ()
+    """Part of the images to use, as COLUMN=x:y:width:height in pixels from the top left corner, e.g. touch=40:0:560:480.
+    It is squeezed to a square, as every image is."""
+    range: tuple[str, ...] = ()
+    """Of images of 16 bits or floating-point numbers (.png, .tif, .npy, arrays): what becomes black and white, as
+    COLUMN=LOW:HIGH; by default 0 and 65535, or 0 and 1 of floats."""
+    bgr: bool = False
+    """Images are stored blue first, as OpenCV writes arrays to HDF5 or zarr."""
     licence: str = "unknown"
     """Licence of the data."""
     source_url: str = ""
@@ -111,6 +120,7 @@ class RowsConfig(DatasetConfig, ABC):
         if (self.background or self.no_contact) and not self.difference:
             raise ValueError("a background is only used with subtract-background: add that option, or leave this out")
         self.conditioned()
+        self.looks()
         if len(self.touch) > 2:
             raise ValueError(f"touch {' '.join(self.touch)}: give one column, or two to stack (left right)")
         named = Counter([*self.touch, *([self.vision] if self.vision else [])])
@@ -141,6 +151,19 @@ class RowsConfig(DatasetConfig, ABC):
         named = [target.name for text in self.values for target in value_task(text).targets]
         return [*named, *(column for used in self.control_columns().values() for column in used)]
 
+    def looks(self) -> dict[str, dict[str, Any]]:
+        """Return image column -> fields of its references: crop, span and bgr."""
+        looks: dict[str, dict[str, Any]] = {}
+        for name, texts, many in (("crop", self.crop, 4), ("span", self.range, 2)):
+            for text in texts:
+                column, _, listed = text.partition("=")
+                numbers = [number for part in listed.split(":") if (number := number_of(part)) is not None]
+                good = len(numbers) == many == listed.count(":") + 1
+                if not good or (numbers[0] >= numbers[1] if many == 2 else min(numbers) < 0 or not all(numbers[2:])):
+                    raise ValueError(f"{text!r}: write COLUMN={'x:y:width:height' if many == 4 else 'LOW:HIGH'}")
+                looks.setdefault(column, {})[name] = tuple(map(int, numbers) if many == 4 else numbers)
+        return looks
+
     def conditioned(self) -> list[str]:
         """Return the columns that the conditions name."""
         return [Condition.parse(text).column for text in (*self.only, *self.label_only, *self.no_contact)]
@@ -158,7 +181,10 @@ class RowsConfig(DatasetConfig, ABC):
 
     def unused(self) -> tuple[str, ...]:
         """Options without effect, which are not part of what identifies a pack."""
-        return () if self.log else ("log", "tolerance", "interpolate")
+        return (
+            *(() if self.log else ("log", "tolerance", "interpolate")),
+            *(name for name in ("crop", "range", "bgr") if not getattr(self, name)),
+        )
 
 
 class Rows(Source):
@@ -220,6 +246,16 @@ class Rows(Source):
             difference=config.difference,
         )
 
+    def _scaled(self, table: Manifest) -> tuple[str, ...]:
+        """Say how numbers of more than 8 bits become gray levels, judged by the first image of each column."""
+        notes = []
+        for column in self._images:
+            ref = next((ref for ref in table.images[column] if ref), None)
+            if ref and is_deep(ref):
+                low, high = ref.span or ("0", "65535, or 1 of floats,")
+                notes.append(f"{column} has more than 8 bits: {low} is black, {high} white (--range {column}=LOW:HIGH)")
+        return tuple(notes)
+
     def _joined(self, table: Manifest) -> Manifest:
         """Return ``table`` with the columns of the logs."""
         config, names = self._config, ("touch", "left", "right", "vision")
@@ -237,6 +273,12 @@ class Rows(Source):
         table.check(*backgrounds)
         paths = {*self._images, *(config.background or ("background",))}
         table = table.resolved((*self._images, *backgrounds), paths)
+        if (looks := config.looks()) or config.bgr:
+            table.check(*looks)
+            like = dict(zip(backgrounds, self._touch, strict=False))  # a background is cropped as its touch
+            how = {column: looks.get(like.get(column, column), {}) | {"bgr": config.bgr} for column in table.images}
+            seen = {c: [ref and replace(ref, **how[c]) for ref in refs] for c, refs in table.images.items()}
+            table = replace(table, images=seen)
         table = table.kept(all_hold(config.only, table), f"no row meets {' and '.join(config.only)}")
         if not config.no_contact and not config.difference:
             return table, []
@@ -283,17 +325,18 @@ class Rows(Source):
         self, table: Manifest, group_by: str, assigned: Sequence[str], labels: dict[str, list[int]]
     ) -> tuple[str, ...]:
         """What results say about logs, and about groups that no column names."""
+        told = (*table.notes, *self._scaled(table))
         if group_by == "video":
-            return (*table.notes, "no column says the groups, so frames of one video are one group")
+            return (*told, "no column says the groups, so frames of one video are one group")
         if group_by != "row":
-            return table.notes
+            return told
         known = {*labels, self._split, self._sensor, *self._images}
         texts = {name: [row[name] for row in table.rows] for name in table.rows[0] if name not in known}
         for column in self._images:  # file names up to their last number
             files = (os.path.splitext(os.path.basename(ref.path))[0] if ref else "" for ref in table.images[column])
             if (stems := [re.sub(r"\d+\D*$", "", file) for file in files]) not in texts.values():
                 texts[f"{column} files"] = stems
-        return (*table.notes, columns.ungrouped(texts, assigned, [*labels.values()]))
+        return (*told, columns.ungrouped(texts, assigned, [*labels.values()]))
 
     def _make_rows(
         self,

@@ -1,11 +1,13 @@
-"""HDF5 files as a table: datasets with one row per frame, in one group or in one group per demonstration.
+"""HDF5 and zarr files as a table: datasets with one row per frame, in one group or in one group per demonstration.
 
     grips.h5          camera, gel  uint8 [N, H, W, 3]      force_n [N]      pose [N, 6]      object [N] (text)
     demos.hdf5        data/demo_0/obs/camera  data/demo_0/obs/gel  data/demo_0/force  data/demo_1/...     (robomimic)
     episode_0.hdf5    observations/images/camera  observations/images/gel  observations/qpos  action      (ACT)
+    buffer.zarr(.zip) data/camera  data/gel  data/action  meta/episode_ends                               (diffusion policy)
 
 A demonstration is a group below which an image dataset has the name asked for, e.g. obs/camera. Its datasets are columns,
-named by their path below it. Attributes of the group, and of the groups above it, are columns of one value.
+named by their path below it. Attributes of the group, and of the groups above it, are columns of one value. A replay buffer
+has all episodes in one group, and their ends (exclusive) in meta/episode_ends.
 """
 
 from collections.abc import Collection, Sequence
@@ -15,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from mvitac.data.images import MAX_PIXELS
-from mvitac.datasets.table.image_refs import Hdf5Row, ImageRef, open_hdf5
+from mvitac.datasets.table.image_refs import ArrayRow, ImageRef, as_array, open_arrays
 from mvitac.datasets.table.manifest import Manifest, text_of
 
 USUAL = ("vision", "touch", "left", "right", "background")
@@ -26,10 +28,11 @@ MAX_NUMBERS = 100_000_000
 """Numbers of one dataset that is a column."""
 MAX_TEXT = 200
 """Characters of the longest attribute that is a column. robomimic keeps whole simulator files in attributes."""
+MAGIC = (b"\xff\xd8", b"\x89P")  # first bytes of a JPEG and of a PNG
 Refs = dict[str, list[ImageRef | None]]
 
 
-def read_hdf5(path: Path, files: Sequence[Path], images: Collection[str], vectors: Collection[str]) -> Manifest:
+def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vectors: Collection[str]) -> Manifest:
     """Return the table of ``files``, which are ``path`` itself or in this folder.
 
     ``images`` are the names of image datasets, by default ``USUAL``; ``vectors`` those of datasets [N, K] that become
@@ -41,19 +44,20 @@ def read_hdf5(path: Path, files: Sequence[Path], images: Collection[str], vector
     left_out: dict[str, str] = {}
     seen = ""
     for file in files:
-        with open_hdf5(file) as opened:
+        with open_arrays(file) as opened:
             everything = _datasets(opened)
             for name in _demonstrations(file, everything, images):
                 demo = "/".join(filter(None, (file.stem if len(files) > 1 or not name else "", name)))
-                datasets = _datasets(opened[name]) if name else everything
+                datasets = _datasets(_at(opened, name))
                 refs = _images(file, name, datasets, images, MAX_ROWS - len(rows))
                 num = len(next(iter(refs.values())))
                 cells = _constants(opened, name, vectors, left_out)
                 cells |= _columns(demo, datasets, num, refs, vectors, left_out)
+                episodes = _episodes(demo, everything.get("meta/episode_ends"), num)
                 for column in {**found, **refs}:
                     found.setdefault(column, [None] * len(rows)).extend(refs.get(column, [None] * num))
-                for i in range(num):
-                    own = {"id": f"{demo}/{i}", "demo": demo, "frame": str(i)}
+                for i, (episode, frame) in enumerate(episodes):
+                    own = {"id": f"{episode}/{frame}", "demo": episode, "frame": str(frame)}
                     rows.append(own | {column: texts[i % len(texts)] for column, texts in cells.items()})
             seen = _seen(everything)
     if missing := [name for name in images if name not in found]:
@@ -64,6 +68,8 @@ def read_hdf5(path: Path, files: Sequence[Path], images: Collection[str], vector
 
 def _datasets(group: Any) -> dict[str, Any]:
     """Return the datasets below ``group`` by their path; ValueError if one shows the content of other files."""
+    if hasattr(group, "members"):  # zarr
+        return dict(sorted((path, item) for path, item in group.members(max_depth=None) if hasattr(item, "shape")))
     found: dict[str, Any] = {}
     group.visititems(lambda path, item: found.update({path: item} if getattr(item, "shape", None) is not None else {}))
     for path, data in found.items():
@@ -79,7 +85,7 @@ def _demonstrations(file: Path, datasets: dict[str, Any], images: Collection[str
     groups: dict[str, str] = {}
     for path, dataset in datasets.items():
         for name in images or USUAL:
-            if f"/{path}".endswith(f"/{name}") and (images or dataset.ndim == 4):
+            if f"/{path}".endswith(f"/{name}") and (images or _holds_images(dataset)):
                 groups.setdefault(path[: -len(name)].rstrip("/"), path)
     if not groups:
         raise _no_images(file, images or USUAL[:2], _seen(datasets))
@@ -94,6 +100,31 @@ def _demonstrations(file: Path, datasets: dict[str, Any], images: Collection[str
             f" name it by its path from there, {path.removeprefix(top).strip('/')}"
         )
     return list(groups)
+
+
+def _episodes(demo: str, ends: Any, num: int) -> list[tuple[str, int]]:
+    """Return the episode of each row and the row's place in it; without ``ends``, the demonstration is one."""
+    if ends is None:
+        return [(demo, i) for i in range(num)]
+    last = np.asarray(ends[...])
+    if not len(last) or last[-1] != num or (np.diff(last) <= 0).any():
+        raise ValueError(f"{demo}: meta/episode_ends does not rise to {num}, the number of images")
+    number = np.searchsorted(last, np.arange(num), side="right")
+    starts = np.r_[0, last][number]
+    return [
+        (f"{demo}/{k}", i - start) for i, (k, start) in enumerate(zip(number.tolist(), starts.tolist(), strict=True))
+    ]
+
+
+def _holds_images(data: Any) -> bool:
+    """Whether a dataset holds images as numbers, or bytes of JPEG or PNG files."""
+    if data.ndim == 4:
+        return True
+    of_bytes = data.ndim == 1 and data.dtype.kind in "SVO"
+    if not (of_bytes or (data.ndim == 2 and data.dtype == np.uint8)) or not data.shape[0]:
+        return False
+    first = as_array(data[0])
+    return bytes(first[:4] if isinstance(first, bytes) else np.asarray(first).ravel()[:4].astype(np.uint8))[:2] in MAGIC
 
 
 def _topmost(group: str, image: Any, rows: set[tuple[Any, ...]]) -> str:
@@ -119,22 +150,23 @@ def _no_images(where: Path, names: Collection[str], seen: str) -> ValueError:
 
 def _images(file: Path, name: str, datasets: dict[str, Any], images: Collection[str], most: int) -> Refs:
     """Return a reference per row of each image dataset of demonstration ``name``, at most ``most``."""
-    shown = {n: d for n, d in datasets.items() if n in images or (n in USUAL and d.ndim == 4)}
+    shown = {n: d for n, d in datasets.items() if n in images or (n in USUAL and _holds_images(d))}
     for data in shown.values():
-        if data.dtype != np.uint8 or data.ndim != 4 or data.shape[3] not in (1, 3) or 0 in data.shape[1:]:
+        numbers = data.ndim == 4 and data.dtype.kind in "uif" and data.shape[3] in (1, 2, 3) and 0 not in data.shape[1:]
+        if not numbers and not (data.ndim < 4 and _holds_images(data)):
             raise ValueError(
-                f"{file}: {data.name} is {data.dtype} {list(data.shape)}: images must be uint8 [rows, height, width, 3],"
-                " or 1 for gray"
+                f"{file}: {data.name} is {data.dtype} {list(data.shape)}: images must be [rows, height, width, 3] as uint8,"
+                " or with 1 or 2 channels, or JPEG or PNG files"
             )
-        if (pixels := data.shape[1] * data.shape[2]) > MAX_PIXELS:
+        if numbers and (pixels := data.shape[1] * data.shape[2]) > MAX_PIXELS:
             raise ValueError(f"{file}: images of {data.name} have {pixels:,} pixels: at most {MAX_PIXELS:,} are read")
-    (first, num), *others = ((data.name, len(data)) for data in shown.values())
+    (first, num), *others = ((data.name, data.shape[0]) for data in shown.values())
     for other, length in others:
         if length != num:
             raise ValueError(f"{file}: {other} has {length} rows, {first} has {num}: images of a row must be there")
     if num > most:
         raise ValueError(f"{file}: {first} has {num:,} rows: at most {MAX_ROWS:,} are read at once, use several packs")
-    return {c: [Hdf5Row(str(file), data.name, i) for i in range(num)] for c, data in shown.items()}
+    return {c: [ArrayRow(str(file), data.name, i) for i in range(num)] for c, data in shown.items()}
 
 
 def _columns(
@@ -150,9 +182,9 @@ def _columns(
     for name, data in datasets.items():
         if name in skip:
             continue
-        text = _is_text(data)
-        if data.ndim and len(data) != num:
-            left_out.setdefault(name, f"has {len(data)} rows in {demo}, the images have {num}: they must be equal")
+        text = data.dtype.kind in "UT" or _is_text(data)
+        if data.ndim and data.shape[0] != num:
+            left_out.setdefault(name, f"has {data.shape[0]} rows in {demo}, the images have {num}: they must be equal")
         elif data.ndim > 2 or (data.dtype.kind not in "biuf" and not text):
             left_out.setdefault(name, f"is {data.dtype} {list(data.shape)}: a column needs a number or a text per row")
         elif data.ndim == 2 and data.shape[1] != 1 and name not in vectors:
@@ -161,7 +193,7 @@ def _columns(
             left_out.setdefault(name, f"has {data.size:,} numbers: a column has at most {MAX_NUMBERS:,}")
         else:
             try:
-                values = (data.asstr("utf-8") if text else data)[()]
+                values = np.asarray((data.asstr("utf-8") if hasattr(data, "asstr") and text else data)[...])
             except UnicodeDecodeError:
                 left_out.setdefault(name, f"is not UTF-8 text in {demo}: write it again")
                 continue
@@ -171,9 +203,15 @@ def _columns(
 
 
 def _is_text(data: Any) -> bool:
+    if "h5py" not in type(data).__module__:
+        return False
     import h5py
 
     return h5py.check_string_dtype(data.dtype) is not None
+
+
+def _at(opened: Any, name: str) -> Any:
+    return opened[name] if name else opened
 
 
 def _constants(opened: Any, name: str, vectors: Collection[str], left_out: dict[str, str]) -> dict[str, list[str]]:
@@ -181,7 +219,7 @@ def _constants(opened: Any, name: str, vectors: Collection[str], left_out: dict[
     cells: dict[str, list[str]] = {}
     parts = name.split("/") if name else []
     for depth in range(len(parts) + 1):
-        for column, value in opened["/".join(parts[:depth]) or "/"].attrs.items():
+        for column, value in _at(opened, "/".join(parts[:depth])).attrs.items():
             plain = np.asarray(value).tolist()
             plain = plain[0] if isinstance(plain, list) and len(plain) == 1 else plain
             plain = plain.decode() if isinstance(plain, bytes) else plain

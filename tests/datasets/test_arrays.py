@@ -6,12 +6,16 @@ import os
 import pickle
 import re
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+import cv2
 import h5py
 import numpy as np
 import pytest
+import zarr
+from PIL import Image
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
@@ -192,6 +196,112 @@ def test_a_damaged_chunk_costs_its_own_rows(tmp_path: Path) -> None:
     assert levels(pack, "vision") == [i for i in range(20) if i not in (6, 7)]
 
 
+# -- zarr, and images that are no uint8 arrays ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["v2", "v3", "zip"])
+def test_a_replay_buffer_in_zarr(tmp_path: Path, kind: str) -> None:
+    """As diffusion policy writes it: all episodes in one group, their ends in meta/episode_ends."""
+    path: Any = tmp_path / ("b.zarr.zip" if kind == "zip" else "b.zarr")
+    with zarr.storage.ZipStore(path, mode="w") if kind == "zip" else nullcontext(str(path)) as store:
+        root = zarr.open_group(store, mode="w", zarr_format=3 if kind == "v3" else 2)
+        content = {
+            "data/camera": grays(*range(20)),
+            "data/gel": grays(*range(100, 120)),
+            "data/force": np.arange(20) / 4,
+        }
+        content |= {"data/state": np.arange(40).reshape(20, 2), "meta/episode_ends": np.array([4, 9, 14, 20])}
+        root.create_group("data", attributes={"robot": "arm"})
+        for name, value in content.items():
+            root.create_array(name, data=value)
+    config = FolderConfig(path=path, vision="camera", touch=("gel",), values=("force:N", "state[1]:m"), size=16)
+    pack = packed(config, tmp_path / "pack")
+    rows = np.array(levels(pack, "vision"))
+    assert sorted(rows) == list(range(20)) and levels(pack, "touch") == (100 + rows).tolist()
+    assert (pack.values(pack.spec.values[0])[:, 0] == rows / 4).all()
+    assert (pack.values(pack.spec.values[1])[:, 0] == 2 * rows + 1).all() and set(pack.column("robot")) == {"arm"}
+    episode = np.searchsorted([4, 9, 14, 20], rows, side="right")
+    assert pack.column("group").tolist() == [f"data/{k}" for k in episode] and pack.spec.group_by == "demo"
+    assert (pack.column("frame").astype(int) == rows - np.array([0, 4, 9, 14])[episode]).all()
+    if kind == "v2":
+        before = config.source().stamps()
+        gel: Any = zarr.open_group(str(path), mode="r+")["data/gel"]
+        gel[3] = 7
+        assert config.source().stamps() != before
+        root["meta/episode_ends"][3] = 19
+        with pytest.raises(ValueError, match=r"meta/episode_ends does not rise to 20"):
+            config.source()
+
+
+@pytest.mark.parametrize("kind", ["list", "padded", "opaque"])
+def test_jpegs_in_hdf5(tmp_path: Path, kind: str) -> None:
+    """As lists of bytes, as rows that end in zeros (ALOHA) and as opaque bytes; and blue first, as OpenCV writes RGB."""
+    files = [cv2.imencode(".jpg", np.full((24, 32, 3), (5 * i, 100, 200), np.uint8))[1].ravel() for i in range(20)]
+    longest = max(map(len, files))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        if kind == "list":
+            gel: Any = file.create_dataset("gel", (20,), h5py.vlen_dtype(np.uint8))
+            for i, one in enumerate(files):
+                gel[i] = one
+        else:
+            rows = np.stack([np.pad(one, (0, longest - len(one))) for one in files])
+            file["gel"] = rows if kind == "padded" else rows.view(f"V{longest}").ravel()
+        file["force_n"] = np.arange(20)
+    for bgr in (False, True):
+        config = FolderConfig(path=tmp_path / "a.h5", touch=("gel",), size=16, bgr=bgr, group="frame")
+        images = packed(config, tmp_path / f"{bgr}").images["touch"][:, 8, 8].astype(int)
+        blue = images[:, 0 if bgr else 2]
+        assert (abs(blue - 5 * np.arange(20)) <= 3).all() and (abs(images[:, 2 if bgr else 0] - 200) <= 3).all()
+
+
+def test_numbers_of_more_than_8_bits(tmp_path: Path) -> None:
+    """Floats from 0 to 1 are images; other ranges are said, by who packs them and then by the pack."""
+    deep = np.linspace(0, 1, 20, dtype=np.float32)[:, None, None, None] * np.ones((1, 16, 16, 3), np.float32)
+    write(tmp_path / "a.h5", {"touch": deep, "vision": (2000 * deep[..., :1]).astype(np.uint16)})
+    options: dict[str, Any] = {"path": tmp_path / "a.h5", "size": 16, "group": "frame"}
+    pack = packed(FolderConfig(**options), tmp_path / "p")
+    assert levels(pack, "touch") == np.rint(deep[:, 0, 0, 0] * 255).tolist() and max(levels(pack, "vision")) == 8
+    assert "vision has more than 8 bits: 0 is black, 65535, or 1 of floats, white" in " ".join(pack.spec.notes)
+    pack = packed(FolderConfig(**options, range=("vision=0:2000",)), tmp_path / "q")
+    assert max(levels(pack, "vision")) == 255 and "0.0 is black, 2000.0 white" in " ".join(pack.spec.notes)
+    rows = []
+    for i in range(20):  # a field of deformation in mm
+        np.save(tmp_path / f"{i}.npy", np.full((16, 16, 2), 0.1 * i - 1, np.float32))
+        Image.fromarray(np.full((16, 16), 100 * i, np.uint16)).save(tmp_path / f"{i}.png")
+        rows.append(f"{i}.npy,{i}.png,{i}")
+    (tmp_path / "m.csv").write_text("touch,vision,take\n" + "\n".join(rows))
+    with pytest.raises(ValueError, match=r"its values lie in -1 to -1, not 0 to 1: --data\.range COLUMN=LOW:HIGH"):
+        packed(FolderConfig(path=tmp_path / "m.csv", size=16, group="take"), tmp_path / "no")
+    config = FolderConfig(path=tmp_path / "m.csv", size=16, group="take", range=("touch=-1:1", "vision=0:1900"))
+    pack = packed(config, tmp_path / "r")
+    level = np.arange(20) * 255 / 19
+    assert (abs(pack.images["vision"][:, 0, 0, 0] - level) <= 0.51).all()
+    assert (abs(pack.images["touch"][:, 0, 0, :2] - np.arange(20)[:, None] * 12.75) <= 0.51).all()
+    assert not pack.images["touch"][..., 2].any()
+
+
+def test_a_crop_is_cut_out_of_images_and_backgrounds(tmp_path: Path) -> None:
+    """Two sensors in one picture, each with a mirror strip that is left out."""
+    for i in range(12):
+        sheet = np.zeros((20, 40, 3), np.uint8)
+        sheet[4:, :20], sheet[4:, 20:] = 10 * i, 100 + 10 * i
+        Image.fromarray(sheet).save(tmp_path / f"{i}.png")
+    rows = "\n".join(f"{i}.png,{i}.png,0.png,0.png,{i}" for i in range(12))
+    (tmp_path / "m.csv").write_text("left,right,a,b,take\n" + rows)
+    crops = ("left=0:4:20:16", "right=20:4:20:16")
+    options: dict[str, Any] = {"path": tmp_path / "m.csv", "size": 16, "group": "take"}
+    pack = packed(FolderConfig(**options, crop=crops), tmp_path / "p")
+    assert (pack.images["touch"][..., 0] == 10 * np.arange(12)[:, None, None]).all()
+    assert (pack.images["touch"][..., 3] == 100 + 10 * np.arange(12)[:, None, None]).all()
+    flat = packed(FolderConfig(**options, crop=crops, difference=True, background=("a", "b")), tmp_path / "d")
+    assert (flat.images["touch"] == 128 + 5 * np.arange(12)[:, None, None, None]).all()
+    with pytest.raises(ValueError, match=r"0\.png is 40 x 20: crop 21:4:20:16 is larger"):
+        packed(FolderConfig(**options, crop=("left=0:4:20:16", "right=21:4:20:16")), tmp_path / "no")
+    for wrong in ("left", "left=1:2:3", "left=0:0:0:4", "left=-1:0:4:4"):
+        with pytest.raises(ValueError, match="write COLUMN=x:y:width:height"):
+            FolderConfig(**options, crop=(wrong,))
+
+
 def nested(**content: Any) -> dict[str, Any]:
     return {f"data/demo_{k}/{name.replace('__', '/')}": value for k in range(2) for name, value in content.items()}
 
@@ -209,14 +319,14 @@ BAD: dict[str, tuple[dict[str, Any], dict[str, str], str]] = {
         "pose has 9 rows in a, the images have",
     ),
     "dtype": (
-        flat(gel=np.zeros((20, 16, 16, 3), np.float32)),
+        flat(gel=np.zeros((20, 16, 16, 3), complex)),
         {},
-        r"/gel is float32 \[20, 16, 16, 3\]: images must be u",
+        r"/gel is complex128 \[20, 16, 16, 3\]: images must be",
     ),
     "axes": (
         flat(gel=np.zeros((20, 16, 16), np.uint8)),
         {},
-        r"/gel is uint8 \[20, 16, 16\]: images must be uint8 \[rows",
+        r"/gel is uint8 \[20, 16, 16\]: images must be \[rows",
     ),
     "channels first": (
         flat(gel=np.zeros((20, 3, 16, 16), np.uint8)),
