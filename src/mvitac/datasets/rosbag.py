@@ -55,7 +55,15 @@ class RosbagConfig(RowsConfig):
 
     def manifest(self) -> Manifest:
         cameras = [topic for topic in (*self.touch, self.vision) if topic]
-        asked = {*self.labels, *self.numbers(), *self.conditioned(), self.group, self.touch_group, self.split, self.sensor}
+        asked = {
+            *self.labels,
+            *self.numbers(),
+            *self.conditioned(),
+            self.group,
+            self.touch_group,
+            self.split,
+            self.sensor,
+        }
         rows: list[Row] = []
         images: dict[str, list[ImageRef | None]] = {topic: [] for topic in cameras}
         dropped = 0
@@ -83,7 +91,9 @@ class RosbagConfig(RowsConfig):
                 rows.append(recording_row(name, i * self.every, float(own[i])) | cells[i])
                 for topic in cameras:
                     images[topic].append(Message(str(bag), topic, stamps[topic][int(at[topic][0][i])]))
-        note = f"topics are joined by time within {self.tolerance:g} s; {dropped} images without all others are left out"
+        note = (
+            f"topics are joined by time within {self.tolerance:g} s; {dropped} images without all others are left out"
+        )
         return Manifest.of(self.path, rows, images, content=sorted(images), notes=(note,))
 
 
@@ -92,7 +102,9 @@ def _bags(path: Path) -> list[Path]:
     if not found and path.is_dir():
         found = sorted([*(file.parent for file in path.rglob("metadata.yaml")), *path.rglob("*.bag")])
     if not found:
-        raise ValueError(f"{path} is no bag and holds none: give a folder with metadata.yaml, a .bag, or a folder of them")
+        raise ValueError(
+            f"{path} is no bag and holds none: give a folder with metadata.yaml, a .bag, or a folder of them"
+        )
     return found
 
 
@@ -114,7 +126,9 @@ def _read(bag: Path, cameras: Sequence[str], asked: Sequence[str]) -> dict[str, 
         topics = {connection.topic: connection.msgtype for connection in reader.connections}
         if not cameras:
             shown = [topic for topic, kind in topics.items() if kind.endswith("Image")]
-            raise ValueError(f"{bag} has the image topics {', '.join(shown) or 'none'}: --data.vision or --data.touch TOPIC")
+            raise ValueError(
+                f"{bag} has the image topics {', '.join(shown) or 'none'}: --data.vision or --data.touch TOPIC"
+            )
         for topic in cameras:
             if topic not in topics:
                 raise ValueError(f"{bag}: {unknown('topic', topic, topics)}")
@@ -124,8 +138,11 @@ def _read(bag: Path, cameras: Sequence[str], asked: Sequence[str]) -> dict[str, 
             message = reader.deserialize(raw, connection.msgtype)
             stamp = getattr(getattr(message, "header", None), "stamp", None)
             time = 1e-9 * received if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
-            topic = connection.topic
-            value = received if topic in cameras else {n: _field(message, n[len(topic) + 1 :]) for n in asked if n.startswith(f"{topic}.")}
+            topic, fields = connection.topic, {}
+            for name in asked if topic in wanted else ():
+                if name.startswith(f"{topic}."):
+                    fields[name] = _field(message, name.removeprefix(f"{topic}."))
+            value = received if topic in cameras else fields
             found[topic].append((time or 1e-9 * received, value))
     return found
 

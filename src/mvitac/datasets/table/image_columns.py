@@ -110,7 +110,8 @@ def check_files(
         named += [("background", ref) for refs in (grounds[i] if grounds else ()) for ref in refs]
         for column, ref in named:
             if ref.path not in stamps:
-                stamps[ref.path] = folder_stamp(ref.path) if ref.path.endswith(".zarr") else stamp_of(ref.path)
+                folder = type(ref) is not ImageRef and os.path.isdir(ref.path)  # zarr, a bag
+                stamps[ref.path] = folder_stamp(ref.path) if folder else stamp_of(ref.path)
             sizes.append(stamps[ref.path][0])
             if sizes[-1] <= 0:
                 name = table.rows[i].get(column) or os.path.basename(ref.path)
