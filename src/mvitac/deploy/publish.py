@@ -1,7 +1,6 @@
 """Publish runs: fit the probes on a finished run's data, write one artifact folder, and push it to the Hub."""
 
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +14,8 @@ from mvitac.deploy.artifact import ARTIFACT, HUB_ID, preprocessing, read
 from mvitac.deploy.card import card
 from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import as_trained, check_unseen, stored_result
-from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import Scored, Source, write_sources
-from mvitac.evaluation.probe import fit_probe, scorable, score_rows, split_rows
+from mvitac.evaluation.probe import FittedProbes, probe_model, scorable, split_rows
 from mvitac.evaluation.regressors import Linear
 from mvitac.evaluation.scores import summarise
 from mvitac.evaluation.sensors import sensors_of
@@ -46,31 +44,24 @@ def fit_probes(model: Model, pack: Pack) -> dict[str, LinearProbe]:
 
 
 def _fit_all(model: Model, pack: Pack) -> list[tuple[LinearProbe, dict[str, Any]]]:
-    """Every linear probe with its record (``evaluation.scores``)."""
-    found = []
+    """Every linear probe with its record (``evaluation.scores``), by task."""
     modalities = [m for m in pack.spec.modalities if m in model.encoders]
-    sources = [*modalities, *(["both"] if len(modalities) == 2 else [])]
-    with work("fitting probes", len(pack.spec.all_tasks) * len(sources), "probes") as advance:
-        for task, source in product(pack.spec.all_tasks, sources):
-            fitted = _fit_probe(model, pack, task, source, modalities if source == "both" else [source])
-            found += [fitted] if fitted else []
-            advance()
-    return found
+    tasks = {m: scorable(pack, m) for m in (*modalities, *(["both"] if len(modalities) == 2 else []))}
+    records: Records = []
+    fitted: FittedProbes = {}
+    with work("fitting probes", sum(map(len, tasks.values())), "probes"):
+        for source, some in tasks.items():
+            records += probe_model(model, pack, some, [source], ["linear"], fitted=fitted) if some else []
+    known = {task.name: task for task in pack.spec.all_tasks}
+    linear = [record for record in records if record["probe"] == "linear"]  # others are of the model's own heads
+    linear.sort(key=lambda record: list(known).index(record["task"]))
+    made = [fitted[record["task"], record["modality"], "linear"] for record in linear]
+    return [(_as_published(pack, known[r["task"]], r, *one), r) for r, one in zip(linear, made, strict=True)]
 
 
-def _fit_probe(
-    model: Model, pack: Pack, task: AnyTask, source: str, modalities: list[str]
-) -> tuple[LinearProbe, dict[str, Any]] | None:
-    """One task's linear probe on features of ``modalities``, and its record; None without rows in train and test."""
-    try:
-        rows = split_rows(pack, task, source)
-    except ValueError:
-        return None
-    x = np.concatenate([features(model, pack, m, rows.all) for m in modalities], axis=1)
-    num = len(rows.fitted)
-    fitted: Any = fit_probe(x[:num], pack, task, rows, "linear", 0)[0]
-    guess, known = fitted(x[num:]), {"task": task.name, "modality": source}
-    record = score_rows(pack, task, rows.test, guess)
+def _as_published(pack: Pack, task: AnyTask, record: dict[str, Any], fitted: Any, guess: np.ndarray) -> LinearProbe:
+    """A ``fitted`` probe with its ``record``; ``guess`` is what it predicts for the test rows."""
+    rows, known = split_rows(pack, task, record["modality"]), {key: record[key] for key in ("task", "modality")}
     if isinstance(task, ValueTask):
         scored = zip(record["targets"], pack.values(task)[rows.test].T, guess.T, strict=True)
         errors = tuple(_error(target, t[~np.isnan(t)], g[~np.isnan(t)]) for target, t, g in scored)
@@ -81,11 +72,7 @@ def _fit_probe(
         about = {"accuracy": record["accuracy"], "majority": majority, "num_test": len(rows.test)}
         info = ProbeInfo(**known, classes=task.classes, **about)
     parts = [*fitted.weights(), *([fitted.bounds] if isinstance(fitted, Linear) else [])]
-    return LinearProbe(info, *(torch.from_numpy(part).float() for part in parts)), {
-        **known,
-        "probe": "linear",
-        **record,
-    }
+    return LinearProbe(info, *(torch.from_numpy(part).float() for part in parts))
 
 
 def _error(target: dict[str, Any], true: np.ndarray, guess: np.ndarray) -> Error:

@@ -101,13 +101,7 @@ def probe_runs(
         ValueError: If a path is no run, a run is given twice, the runs and the data do not fit together, or a run was
             trained on rows or groups that other data than its own would score.
     """
-    if not (paths or encoders):
-        raise ValueError("give at least one run's folder")
-    for path in paths:
-        if path.is_file():
-            raise ValueError(f"{path} is a file: give the run's folder, where the scores are also written")
-        if [p.resolve() for p in paths].count(path.resolve()) > 1:
-            raise ValueError(f"run {path} is given twice: it would count as two seeds, give it once")
+    _check_paths(paths, encoders)
     others = open_encoders(encoders, pack)
     models = [load(path, weights) for path in paths]
     names = [name + ", best" * (weights == "best") for name in names_of(paths, models)]
@@ -116,14 +110,9 @@ def probe_runs(
     for path, model in zip(paths, models, strict=True):
         check_place(path / "probe.json")
         check_channels(path, model, pack, pack.spec.modalities)
-    for task in () if session.folds else tasks:  # has rows to fit and to score
-        for modality in seen_by(pack, task, modalities):
-            split_rows(pack, task, modality)
     # The initial weights that an artifact names may be any file or download.
     runs = [m.run.fresh() if m.foreign else m.run for m in models]
-    for _, run in frozen_trunks(runs) if session.controls else ():
-        for config in {run.encoder.vision, run.encoder.touch}:
-            build_trunk(config, 3)  # missing weights are found before any probe is fitted
+    _check_before(runs, pack, tasks, modalities, session)
     sources = check_unseen(paths, pack, tasks, allow_leak=allow_leak or bool(session.folds))
     score = partial(_score, [*zip(paths, models, names, sources, strict=True)], runs, modalities, session)
     if session.folds:
@@ -148,6 +137,28 @@ def probe_runs(
         name = "probe" + ".best" * (weights == "best") + ".folds" * bool(session.folds)
         write_json(path / f"{name}.json", result, sealed=True)
     return Scores(result)
+
+
+def _check_paths(paths: Sequence[Path], encoders: Sequence[str]) -> None:
+    if not (paths or encoders):
+        raise ValueError("give at least one run's folder")
+    for path in paths:
+        if path.is_file():
+            raise ValueError(f"{path} is a file: give the run's folder, where the scores are also written")
+        if [p.resolve() for p in paths].count(path.resolve()) > 1:
+            raise ValueError(f"run {path} is given twice: it would count as two seeds, give it once")
+
+
+def _check_before(
+    runs: Sequence[Run], pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str], session: ProbeConfig
+) -> None:
+    """ValueError, before any probe is fitted, if a task has no rows to fit and to score, or weights are missing."""
+    for task in () if session.folds else tasks:
+        for modality in seen_by(pack, task, modalities):
+            split_rows(pack, task, modality)
+    for _, run in frozen_trunks(runs) if session.controls else ():
+        for config in {run.encoder.vision, run.encoder.touch}:
+            build_trunk(config, 3)
 
 
 def _score(

@@ -31,6 +31,8 @@ VALUE_PROBES = ("linear", "knn")
 
 FeatureSource = Callable[[str, np.ndarray], np.ndarray]  # (modality, pack rows) -> features [len(rows), D]
 Fitted = Callable[[np.ndarray], np.ndarray]  # features -> class probabilities or values
+FittedProbes = dict[tuple[str, str, str], tuple[Fitted, np.ndarray]]
+"""Task, modality and kind of a probe -> the probe, and what it predicts for the test rows."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,13 @@ def probe_features(
     x: np.ndarray, pack: Pack, task: AnyTask, rows: ProbeSplit, kind: str, seed: int, paper: Classifier | None = None
 ) -> dict[str, Any]:
     """Fit and score one probe of ``kind`` on features ``x`` of ``rows.all``; ``paper`` is an already fitted one."""
+    return fit_and_score(x, pack, task, rows, kind, seed, paper)[0]
+
+
+def fit_and_score(
+    x: np.ndarray, pack: Pack, task: AnyTask, rows: ProbeSplit, kind: str, seed: int, paper: Classifier | None = None
+) -> tuple[dict[str, Any], tuple[Fitted, np.ndarray]]:
+    """``probe_features``, and the probe with what it predicts for the test rows."""
     if percent := percent_of(kind):
         train, val = few(pack, task, rows.train, rows.val, percent, seed)
         keep = np.concatenate([train, len(rows.train) + val, np.arange(len(rows.fitted), len(x))])
@@ -125,7 +134,7 @@ def probe_features(
     predicted = predict(x[num:])
     if isinstance(predict, Linear):
         extra["clipped"] = predict.clipped(x[num:])
-    return {**score_rows(pack, task, rows.test, predicted), **extra}
+    return {**score_rows(pack, task, rows.test, predicted), **extra}, (predict, predicted)
 
 
 def fit_probe(
@@ -174,6 +183,7 @@ def probe_model(
     modalities: Sequence[str],
     probes: Sequence[str],
     standardise: tuple[Standardise, ...] = (),
+    fitted: FittedProbes | None = None,
 ) -> list[dict[str, Any]]:
     """Probe every task and modality that ``model`` has an encoder for, and its own heads where it has some.
 
@@ -192,7 +202,7 @@ def probe_model(
     def source(modality: str, rows: np.ndarray) -> np.ndarray:
         return np.concatenate([by_modality[m][np.searchsorted(own[m], rows)] for m in names_in(modality, pack)], axis=1)
 
-    records = probe_all(source, pack, tasks, modalities, probes, model.seed)
+    records = probe_all(source, pack, tasks, modalities, probes, model.seed, fitted)
     return records + own_heads(model, pack, tasks, modalities)
 
 
@@ -243,10 +253,11 @@ def probe_all(
     modalities: Sequence[str],
     probes: Sequence[str],
     seed: int,
+    fitted: FittedProbes | None = None,
 ) -> list[dict[str, Any]]:
     """Records of every (task, modality, probe) on the features of ``source``. The paper's probe has no values.
 
-    Each fitted probe advances the ``progress.work`` that counts "probes".
+    ``fitted`` receives the probes. Each of them advances the ``progress.work`` that counts "probes".
     """
     classed = [task for task in tasks if isinstance(task, Task)]
     papers = _papers(source, pack, classed, modalities, seed) if "paper" in probes else {}
@@ -256,7 +267,9 @@ def probe_all(
             rows = split_rows(pack, task, modality)
             x = source(modality, rows.all)
             for kind in probes_of(task, probes):
-                result = probe_features(x, pack, task, rows, kind, seed, papers.get((task.name, modality)))
+                result, made = fit_and_score(x, pack, task, rows, kind, seed, papers.get((task.name, modality)))
+                if fitted is not None:
+                    fitted[task.name, modality, kind] = made
                 tick("probes")
                 records.append({"task": task.name, "modality": modality, "probe": kind, **result})
     return records
