@@ -237,10 +237,10 @@ def test_from_run_json_repeats_it(pack: Pack, straight: Path, tmp_path: Path) ->
 
 
 def test_learns_the_stripes(tmp_path: Path) -> None:
-    """80 steps on three patterns: kNN on unseen instances well above the untrained trunk's, by touch and by vision."""
-    pack = toy_pack(tmp_path / "pack", num=360)
+    """50 steps on three patterns: kNN on unseen instances well above the untrained trunk's, by touch and by vision."""
+    pack = toy_pack(tmp_path / "pack", num=240)
     optim = Optim(name="adamw", lr=3e-3, schedule="cosine", warmup=0.1)
-    run = smoke(pack, steps=80, batch_size=60, optim=optim, eval_every=0)
+    run = smoke(pack, steps=50, batch_size=60, optim=optim, eval_every=0)
     before = validate(fresh(run, pack.spec, pack.size), pack, run)[0]
     log = train(run, tmp_path / "r", quiet=True) / "log.jsonl"
     lines = [json.loads(line) for line in log.read_text().splitlines()]
