@@ -100,11 +100,9 @@ def test_pretrain_starts_nothing_without_data(options: list[str], capsys: pytest
         assert word in said
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    request: pytest.FixtureRequest,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = "--data.num 240 --data.touches 2 --data.size 32 --data.workers 1 --augment.size 32 --augment.whole 32"
     tiny = "--encoder.trunk mvitac_tiny --steps 2 --batch-size 16 --precision fp32"
@@ -127,7 +125,6 @@ def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
     weights = tmp_path / "demo" / "seed1" / "model.safetensors"
     before = weights.stat().st_mtime_ns
     monkeypatch.setattr("mvitac.experiments.demo.probe_runs", None)  # calling it would raise
-    request.getfixturevalue("undrawn")
     assert main(command) == 0
     assert weights.stat().st_mtime_ns == before
     assert json.loads((tmp_path / "demo" / "summary.json").read_text()) == summary
