@@ -65,14 +65,11 @@ def auto(pack: Pack, **changes: object) -> Run:
 def test_auto_on_cpus(
     avx512_bf16: bool | None, amx: bool | None, onednn: bool | None, expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for where, name, answer in (
-        (torch.cpu, "_is_avx512_bf16_supported", avx512_bf16),
-        (torch.cpu, "_is_amx_tile_supported", amx),
-    ):
+    for name, answer in (("_is_avx512_bf16_supported", avx512_bf16), ("_is_amx_tile_supported", amx)):
         if answer is None:
-            monkeypatch.delattr(where, name)
+            monkeypatch.delattr(torch.cpu, name)
         else:
-            monkeypatch.setattr(where, name, lambda answer=answer: answer)
+            monkeypatch.setattr(torch.cpu, name, lambda answer=answer: answer)
     known = {} if onednn is None else {"_is_mkldnn_bf16_supported": lambda: onednn}
     monkeypatch.setattr(torch.ops, "mkldnn", SimpleNamespace(**known))
     assert Hardware.choose(CPU, "auto").precision == expected
