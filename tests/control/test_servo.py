@@ -23,7 +23,7 @@ KINDS = [kind for task in TASKS.values() for kind in task.kinds]
 
 @pytest.fixture(scope="module")
 def small() -> suite.ServoSuite:
-    few: Any = {"shapes": 2, "steps": 6, "settle": 2, "fit_shapes": 6, "fit_presses": 4, "fit_val": 2, "epochs": 1}
+    few: Any = {"shapes": 2, "steps": 6, "settle": 2, "fit_shapes": 6, "fit_presses": 4, "fit_val": 2, "train_steps": 2}
     texts = tuple(map(RANDOM.format, range(2)))
     late = (Condition(name="known sensor"), Condition(name="late", latency_ms=50, new_sensor=True))
     return replace(find_suite("servo-v1"), name="small-v1", **few, untrained=texts, conditions=late)

@@ -1,10 +1,10 @@
 """Results of closed-loop suites: one JSON file per encoder, like those of ``bench.result``.
 
-    format, suite (definition), suite_digest, encoder, versions, data (digests of what probes are fitted on)
-    rows      of the encoder and each control, for each task and condition: sums per shape. It holds no score
+    format, suite (definition), suite_digest, encoder, versions, data (digests of what is learned from)
+    rows      of the encoder and each control, for each task and condition: sums per shape or episode, no score
     digest    sha256 of all of this; ``about`` (time, machine, commit) is not in it
 
-A row that needs no picture, the true pose, is computed again when a result is checked.
+The row that needs no picture, of the true pose or the expert, is computed again when a result is checked.
 """
 
 import contextlib
@@ -19,14 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 from tabulate import tabulate
 
 from mvitac.bench.encoder import About, describe
 from mvitac.bench.result import VOLATILE, write_result
-from mvitac.control.servo import TASKS
-from mvitac.control.servo_rows import SUMS, TRUE, Servo
-from mvitac.control.suite import ServoSuite, find_suite, read_suite, shipped
+from mvitac.control.insert_rows import Insert
+from mvitac.control.servo_rows import Servo
+from mvitac.control.suite import InsertSuite, ServoSuite, find_suite, read_suite, shipped
 from mvitac.deploy.artifact import load
 from mvitac.evaluation.intervals import mean_interval
 from mvitac.experiments.plan import slug
@@ -37,11 +36,24 @@ from mvitac.system.progress import work
 from mvitac.system.provenance import provenance
 
 FORMAT, FORMAT_VERSION = "mvitac-control", 1
+OWN = ("", "touch shuffled")  # rows of the encoder that is scored
 ALL = "all"
-Scores = np.ndarray  # [seeds, shapes]
+Means = dict[tuple[str, str, str], np.ndarray]  # task, condition, sum -> [seeds, shapes or episodes]
 
 
-def run_suite(places: Sequence[str], suite: ServoSuite, out: Path, about: About) -> Path:
+def loop(suite: ServoSuite | InsertSuite, mapped: Callable[..., Any] = map) -> Servo | Insert:
+    """What scores the rows of ``suite``."""
+    return Insert(suite, mapped) if isinstance(suite, InsertSuite) else Servo(suite, mapped)
+
+
+@contextlib.contextmanager
+def pool(num: int) -> Iterator[Callable[..., Iterator[Any]]]:
+    """``map`` over ``num`` processes, in order; they import no torch."""
+    with ProcessPoolExecutor(num, multiprocessing.get_context("spawn")) as processes:
+        yield partial(processes.map, chunksize=5)
+
+
+def run_suite(places: Sequence[str], suite: ServoSuite | InsertSuite, out: Path, about: About) -> Path:
     """Score an encoder (its seeds) on ``suite`` and write <out>/<suite>-<name>.json.
 
     The same call continues an interrupted one. Rows of controls, the same for every encoder, are kept in <out>/parts.
@@ -53,9 +65,9 @@ def run_suite(places: Sequence[str], suite: ServoSuite, out: Path, about: About)
     start, here = time.perf_counter(), provenance()
     rows, busy = [], f"another process writes {path}: wait for it, or give another --out"
     with hold_lock(path, busy, wait=False), pool(os.cpu_count() or 1) as mapped:
-        servo = Servo(suite, mapped)
-        asked = servo.rows(models)
-        with work(f"{encoder['name']} on {suite.name}", len(asked) * len(_kinds()), "kinds"):
+        runner = loop(suite, mapped)
+        asked = runner.rows(models)
+        with work(f"{encoder['name']} on {suite.name}", len(asked), "rows") as advance:
             for row in asked:
                 known = [suite.digest(), row.source, row.seed, here["versions"], here["commit"]]
                 key = digest([*known, encoder if row.source in OWN else ""])
@@ -64,26 +76,13 @@ def run_suite(places: Sequence[str], suite: ServoSuite, out: Path, about: About)
                     write_json(kept, {"cells": row.score()}, sealed=True)
                 found = read_json(kept, "a part of a suite")["cells"]
                 rows.append({"source": row.source, "seed": row.seed, "cells": found})
+                advance()
         now = {"time": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": round(time.perf_counter() - start)}
         value = {"format": FORMAT, "format_version": FORMAT_VERSION, "suite": suite.definition()}
         value |= {"suite_digest": suite.digest(), "encoder": encoder, "versions": here.pop("versions")}
-        value |= {"data": servo.data(), "rows": rows}
+        value |= {"data": runner.data(), "rows": rows}
         write_result(path, {**value, "digest": digest(value), "about": {**here, **now}})
     return path
-
-
-@contextlib.contextmanager
-def pool(num: int) -> Iterator[Callable[..., Iterator[Any]]]:
-    """``map`` over ``num`` processes, in order; they import no torch."""
-    with ProcessPoolExecutor(num, multiprocessing.get_context("spawn")) as processes:
-        yield partial(processes.map, chunksize=5)
-
-
-OWN = ("", "touch shuffled")  # rows of the encoder that is scored
-
-
-def _kinds() -> list[str]:
-    return [kind for task in TASKS.values() for kind in task.kinds]
 
 
 def is_result(path: Path) -> bool:
@@ -99,56 +98,54 @@ def read_control(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} does not match its digest: it was changed after it was written, run the suite again")
     with fields_of(path):
         suite = read_suite(value["suite"])
-        if suite.name not in shipped() or find_suite(suite.name).digest() != value["suite_digest"] != "":
+        if (
+            suite.name not in shipped()
+            or not find_suite(suite.name).digest() == suite.digest() == value["suite_digest"]
+        ):
             raise ValueError(f"{path} is not of this version's {suite.name}: run the suite again")
-        if suite.digest() != value["suite_digest"]:
-            raise ValueError(f"{path}: the suite inside does not have the digest that the file says")
-        if found := next(_problems(value, suite), ""):
+        if found := next(_problems(value, loop(suite)), ""):
             raise ValueError(f"{path}: {found}")
     return value
 
 
 def pinned(value: dict[str, Any]) -> str:
-    """Whether the presses are those that the suite was measured on: same, other pixels (another machine), not pinned."""
+    """Whether its data is what the suite was measured on: same, other pixels (another machine), not pinned."""
     pins = find_suite(value["suite"]["name"]).pins
     return "not pinned" if not pins else "same" if pins == value["data"] else "other pixels"
 
 
-def _problems(value: dict[str, Any], suite: ServoSuite) -> Iterator[str]:
+def _problems(value: dict[str, Any], runner: Servo | Insert) -> Iterator[str]:
     seeds = value["encoder"]["seeds"]
-    want = [("", seed) for seed in seeds] + [("touch shuffled", seeds[0]), (TRUE, None), ("no touch", None)]
-    want += [("pixels", None), *(("untrained", seed) for seed in range(len(suite.untrained))), ("end to end", None)]
+    want = [*(("", seed) for seed in seeds), ("pixels", None)]
+    want += [("untrained", seed) for seed in range(len(runner.suite.untrained))]
+    rest = [("touch shuffled", seeds[0]), (runner.true, None)]
     have = [(row["source"], row["seed"]) for row in value["rows"]]
-    if have not in (want, [*want, ("imagenet", None)]):
-        yield f"has the rows {have}, the suite asks for {want}"
-    cells = [(kind, condition.name) for kind in _kinds() for condition in suite.conditions]
-    limits = {kind: (t.limit[0], np.hypot.reduce(t.limit[1:])) for t in TASKS.values() for kind in t.kinds}
-    steps = suite.steps - suite.settle
+    blind = "no touch" if isinstance(runner, Servo) else "no senses"
+    rest += [(blind, None), ("end to end", None)]
+    if have not in ([*want, *rest], [*want, ("imagenet", None), *rest]):
+        yield f"has the rows {have}, the suite asks for {want + rest}"
     for row in value["rows"]:
-        if [(cell["task"], cell["condition"]) for cell in row["cells"]] != cells:
-            yield f"{row['source'] or 'the encoder'} has other tasks or conditions than the suite"
+        who = row["source"] or "the encoder"
+        if [(cell["task"], cell["condition"]) for cell in row["cells"]] != runner.cells(row["source"]):
+            yield f"{who} has other tasks or conditions than the suite"
         for cell in row["cells"]:
-            n, mm, deg, lost = (np.array(cell[key], float) for key in ("n", *SUMS))
-            most, possible = limits[cell["task"]], np.isfinite([mm, deg, lost]).all() and (n == steps).all()
-            possible &= {len(mm), len(deg), len(lost), len(n)} == {suite.shapes} and (lost == lost.round()).all()
-            for each, limit in ((mm, most[0]), (deg, most[1])):  # steps without contact have the limit
-                possible &= bool((each >= lost * limit - 1e-6).all() and (each <= n * limit + 1e-6).all())
-            if not (possible and (lost >= 0).all()):
-                yield f"{row['source'] or 'the encoder'}, {cell['task']}, {cell['condition']}: no episodes give these sums"
-    true = next(row["cells"] for row in value["rows"] if row["source"] == TRUE)
-    for cell, again in zip(true, Servo(suite).run(None), strict=True):
-        if not np.allclose([cell[key] for key in SUMS], [again[key] for key in SUMS], rtol=1e-4, atol=1e-4):
-            yield f"the true pose gives other sums here in {cell['task']}, {cell['condition']}"
+            sums = np.array([cell[key] for key in runner.sums], float)
+            if not np.isfinite(sums).all() or runner.impossible(cell["task"], np.array(cell["n"]), sums):
+                yield f"{who}, {cell['task']}, {cell['condition']}: no episodes give these sums"
+    true = next(row["cells"] for row in value["rows"] if row["source"] == runner.true)
+    for cell, again in zip(true, runner.again(), strict=True):
+        if not np.allclose(*([one[key] for key in runner.sums] for one in (cell, again)), rtol=1e-3, atol=1e-3):
+            yield f"{runner.true} gives other sums here in {cell['task']}, {cell['condition']}"
 
 
-def scores(value: dict[str, Any]) -> dict[str, dict[tuple[str, str, str], Scores]]:
-    """Source -> (task, condition, sum) -> means of each step, [seeds, shapes]. ``ALL`` is the mean over conditions."""
+def scores(value: dict[str, Any]) -> dict[str, Means]:
+    """Source -> means by task, condition and sum. Condition ``ALL`` is the mean over conditions."""
     found: dict[str, dict[tuple[str, str, str], list[np.ndarray]]] = {}
     for row in value["rows"]:
         mine = found.setdefault(row["source"] or value["encoder"]["name"], {})
         of_seed: dict[tuple[str, str, str], list[np.ndarray]] = {}
         for cell in row["cells"]:
-            for key in SUMS:
+            for key in (name for name in cell if name not in ("task", "condition", "n")):
                 each = np.array(cell[key]) / np.array(cell["n"])
                 of_seed[cell["task"], cell["condition"], key] = [each]
                 of_seed.setdefault((cell["task"], ALL, key), []).append(each)
@@ -158,40 +155,37 @@ def scores(value: dict[str, Any]) -> dict[str, dict[tuple[str, str, str], Scores
 
 
 def tables(values: Sequence[dict[str, Any]]) -> dict[str, tuple[list[str], list[list[str]]]]:
-    """Title -> columns and rows: one table over all conditions, with p against the untrained trunk, then each condition."""
-    known: dict[str, dict[tuple[str, str, str], Scores]] = {}
+    """Title -> columns and rows: one table over all conditions, then one for each. Controls are those of the last file."""
+    runner = loop(find_suite(values[0]["suite"]["name"]))
+    known: dict[str, Means] = {}
     for value in values:
-        known = {**scores(value), **known}
-    suite, kinds = find_suite(values[0]["suite"]["name"]), _kinds()
+        known |= scores(value)
     found = {}
-    for condition in (ALL, *(c.name for c in suite.conditions)):
-        rows = [[source, *(_cell(known, source, kind, condition) for kind in kinds)] for source in known]
-        title = "all conditions" if condition == ALL else condition
-        found[title] = (["", *kinds], rows)
+    for condition in (ALL, *dict.fromkeys(name for _, name in runner.cells(""))):
+        rows = [[source, *(_cell(runner, known, source, k, condition) for k in runner.kinds)] for source in known]
+        found["all conditions" if condition == ALL else condition] = (["", *runner.kinds], rows)
     return found
 
 
-def _cell(known: dict[str, dict[tuple[str, str, str], Scores]], source: str, kind: str, condition: str) -> str:
-    mine = known[source]
-    mm, low, high, _ = mean_interval(mine[kind, condition, "mm"])
-    text = f"{mm:.2f} [{max(low, 0):.2f}, {high:.2f}] mm, {mine[kind, condition, 'deg'].mean():.1f} deg"
-    if lost := mine[kind, condition, "lost"].mean():
-        text += f", {100 * lost:.0f} % lost"
-    if source != "untrained":
-        p = mean_interval(mine[kind, condition, "mm"] - known["untrained"][kind, condition, "mm"].mean(0))[3]
-        text += "" if p >= 0.05 else " *"
-    return text
+def _cell(runner: Servo | Insert, known: dict[str, Means], source: str, kind: str, condition: str) -> str:
+    """Errors and interval, and * where the difference to the untrained trunk has p < .05."""
+    means = {key: known[source][kind, condition, key] for key in runner.sums if (kind, condition, key) in known[source]}
+    if not means:
+        return ""
+    first = next(iter(means.values()))
+    text = runner.text(means, mean_interval(first))
+    other = known["untrained"][kind, condition, runner.sums[0]].mean(0)
+    return text + " *" * (source != "untrained" and mean_interval(first - other)[3] < 0.05)
 
 
-NOTE = """Mean error over scored steps, with the 95 % interval over shapes (and seeds). Steps after contact was lost have the
-largest error. * differs from the untrained trunk, p < .05, paired by shape, not corrected for the number of cells."""
+STAR = "* differs from the untrained trunk, p < .05, paired by shape or episode, not corrected for the number of cells."
 
 
 def print_result(value: dict[str, Any]) -> None:
     """Print the tables of one result."""
     for title, (columns, rows) in tables([value]).items():
         print(f"{value['suite']['name']}, {title}\n{tabulate(rows, columns)}\n")
-    print(f"{' '.join(NOTE.split())} Presses: {pinned(value)}.")
+    print(f"{loop(find_suite(value['suite']['name'])).note}. {STAR} Data: {pinned(value)}.")
 
 
 def write_page(files: Sequence[Path], out: Path) -> Path:
@@ -201,8 +195,8 @@ def write_page(files: Sequence[Path], out: Path) -> Path:
         raise ValueError(f"{files[-1]} is of another suite than {files[0]}: make a page for each")
     suite = find_suite(values[0]["suite"]["name"])
     head = page.head(suite.name, "mvitac bench", {"definition": suite.digest()[:12]}, suite.title)
-    note = page.paragraph(" ".join(NOTE.split()))
-    sections: list[tuple[str, str, list[Markup]]] = [
+    note = page.paragraph(f"{loop(suite).note}. {STAR}")
+    sections = [
         (f"table{number}", title, [*([note] * (not number)), page.table(columns, rows, words=True, label=title)])
         for number, (title, (columns, rows)) in enumerate(tables(values).items())
     ]

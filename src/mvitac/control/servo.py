@@ -123,7 +123,7 @@ class Edge:
         cos, sin = math.cos(state[2]), math.sin(state[2])
         wx, wy = state[0] + cos * x - sin * y, state[1] + sin * x + cos * y
         mean, swing = shape.drift
-        return mean + swing * math.sin(0.3 * state[0]) + shape.height(wx, wy) + _textured(shape, wx, wy)
+        return mean + swing * math.sin(0.3 * state[0]) + shape.height(wx, wy) + textured(shape, wx, wy)
 
 
 class Surface:
@@ -163,7 +163,7 @@ class Surface:
     @staticmethod
     def indent(shape: Shape, state: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         plane = state[1] + state[2] * x + state[3] * y
-        return shape.height(state[0] + x, y) - plane + _textured(shape, state[0] + x, y)
+        return shape.height(state[0] + x, y) - plane + textured(shape, state[0] + x, y)
 
 
 TASKS: dict[str, Any] = {"edge": Edge, "surface": Surface}
@@ -174,7 +174,7 @@ def task_of(kind: str) -> Any:
     return next(task for task in TASKS.values() if kind in task.kinds)
 
 
-def _textured(shape: Shape, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def textured(shape: Shape, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     places = [(y + 25) / MAP_MM, (x + 25) / MAP_MM]
     return map_coordinates(shape.texture, places, order=1, mode="mirror")
 
@@ -188,9 +188,14 @@ class Copy:
     gain: float
 
     def touch(self, shape: Shape, state: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """What it sees: uint8 [64, 64, 3]."""
+        """What it sees of a shape: uint8 [64, 64, 3]."""
+        x, y, _ = grid(SIZE, FIELD_MM)
+        return self.press(task_of(shape.kind).indent(shape, state, x, y), rng)
+
+    def press(self, height_mm: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """What it sees of heights above the apex of its gel, [128, 128] in mm."""
         x, y, pixel = grid(SIZE, FIELD_MM)
-        indent = task_of(shape.kind).indent(shape, state, x, y) - (x * x + y * y) / (2 * DOME_MM)
+        indent = height_mm - (x * x + y * y) / (2 * DOME_MM)
         imprint = gel.relax(np.clip(indent, 0, 2.5).astype(np.float32), pixel_mm=pixel)
         return gel.render(imprint, self.sensor, rng, pixel_mm=pixel, size=SIZE, unit=self.unit, gain=self.gain)
 

@@ -1,57 +1,32 @@
 """The rows of ``servo-v1``: who estimates the pose, and how far from its target each episode then stays."""
 
-import copy
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-import torch
-from torch import nn
 
-from mvitac.bench.external import open_model
-from mvitac.control.servo import STEP_MS, TASKS, Episode, presses, touch_at
+from mvitac.control.learn import Cells, Encode, Row, encoding, frozen_rows, train
+from mvitac.control.servo import STEP_MS, TASKS, Episode, presses, task_of, touch_at
 from mvitac.control.suite import ServoSuite
 from mvitac.evaluation.regressors import fit_ridge
 from mvitac.model import Model
-from mvitac.sim.gel import area_resize
 from mvitac.system.progress import tick
 
-Encode = Callable[[np.ndarray], np.ndarray]  # images uint8 [N, S, S, 3] -> features [N, D]
-SUMS = ("mm", "deg", "lost")  # of the scored steps of one shape
-TRUE, NONE, SHUFFLED = "true pose", "no touch", "touch shuffled"
-
-
-@dataclass(frozen=True)
-class Row:
-    """One row of a suite, and the function that scores it."""
-
-    source: str  # "" is the encoder
-    seed: int | None
-    score: Callable[[], list[dict[str, Any]]]
-
-
-def encoding(model: Model) -> Encode:
-    """The frozen features of touch of ``model``; ValueError if it does not read single images of one gel."""
-    if "touch" not in model.encoders or model.spec.channels("touch") != 3 or model.spec.difference:
-        raise ValueError(f"{model!r} does not read plain images of one gel, which closed-loop suites give")
-
-    def encode(images: np.ndarray) -> np.ndarray:
-        chunks = torch.from_numpy(images).permute(0, 3, 1, 2).split(256)
-        return torch.cat([model.features("touch", chunk) for chunk in chunks]).numpy()
-
-    return encode
-
-
-def pixels(images: np.ndarray) -> np.ndarray:
-    """8 x 8 pixels of each image, [N, 192]."""
-    return np.stack([area_resize(image.astype(np.float32), 8, 8).ravel() for image in images])
+Estimate = Callable[[str, np.ndarray], np.ndarray]  # task, images -> poses
 
 
 class Servo:
-    """A suite with its presses, which are rendered once for all rows."""
+    """The suite, and the presses that are rendered once for all rows."""
+
+    sums: ClassVar[tuple[str, ...]] = ("mm", "deg", "lost")  # of the scored steps of one shape
+    kinds: ClassVar[list[str]] = [kind for task in TASKS.values() for kind in task.kinds]
+    true: ClassVar[str] = "true pose"
+    note: ClassVar[str] = (
+        "Mean error over scored steps with the 95 % interval over shapes (and seeds). Steps after contact was lost have"
+        " the largest error"
+    )
 
     def __init__(self, suite: ServoSuite, mapped: Callable[..., Iterable[Any]] = map) -> None:
         self.suite, self.map = suite, mapped  # ``map``, or that of a pool of processes
@@ -69,119 +44,87 @@ class Servo:
         """Digests of the presses."""
         return {name: hashlib.sha256(images.tobytes()).hexdigest() for name, (images, _) in self.presses.items()}
 
-    def rows(self, models: Sequence[Model]) -> list[Row]:
-        """The encoder's seeds, then the controls."""
-        own = [Row("", model.seed, lambda m=model: self._probed(encoding(m))) for model in models]
-        suite, shuffled = self.suite, encoding(models[0])
-        random = [open_model(text) for text in suite.untrained]
-        found = [*own, Row(SHUFFLED, models[0].seed, lambda: self._probed(shuffled, shuffle=True))]
-        found += [Row(TRUE, None, lambda: self.run(None)), Row(NONE, None, self._blind)]
-        found += [Row("pixels", None, lambda: self._probed(pixels))]
-        found += [Row("untrained", model.seed, lambda m=model: self._probed(encoding(m))) for model in random]
-        found.append(Row("end to end", None, lambda: self._trained(random[0])))
-        try:
-            known = open_model(suite.imagenet)
-        except ValueError:  # its weights cannot be had here
-            return found
-        return [*found, Row("imagenet", None, lambda: self._probed(encoding(known)))]
+    def cells(self, source: str) -> list[tuple[str, str]]:
+        """The tasks and conditions that a row has."""
+        return [(kind, condition.name) for kind in self.kinds for condition in self.suite.conditions]
 
-    def _probed(self, encode: Encode, *, shuffle: bool = False) -> list[dict[str, Any]]:
+    def rows(self, models: Sequence[Model]) -> list[Row]:
+        """The encoder's seeds first, then the controls."""
+        suite, found = self.suite, []
+        for source, seed, encode in frozen_rows(models, suite.untrained, suite.imagenet):
+            found.append(Row(source, seed, lambda e=encode: self._probed(e)))
+        own = encoding(models[0])
+        shuffled = Row("touch shuffled", models[0].seed, lambda: self._probed(own, shuffle=True))
+        blind = Row("no touch", None, lambda: self.run(lambda name, _: self.presses[name][1].mean(0), see=False))
+        return [*found, shuffled, Row(self.true, None, self.again), blind, Row("end to end", None, self._trained)]
+
+    def again(self) -> Cells:
+        """The row of the true pose, which needs no picture."""
+        return self.run(None)
+
+    def _probed(self, encode: Encode, *, shuffle: bool = False) -> Cells:
         fitted = {}
         for name, (images, poses) in self.presses.items():
-            held = self.suite.fit_val * self.suite.fit_presses
-            fitted[name] = fit_ridge(encode(images), poses, held)[0]
-        return self.run(lambda name, images: fitted[name](encode(images)), shuffle=shuffle)
+            fitted[name] = fit_ridge(encode("touch", images), poses, self.suite.fit_val * self.suite.fit_presses)[0]
+        return self.run(lambda name, images: fitted[name](encode("touch", images)), shuffle=shuffle)
 
-    def _blind(self) -> list[dict[str, Any]]:
-        """The mean of the presses' poses, whatever is touched."""
-        return self.run(lambda name, images: np.tile(self.presses[name][1].mean(0), (len(images), 1)), see=False)
+    def _trained(self) -> Cells:
+        text, steps = self.suite.untrained[0], self.suite.train_steps
+        known = {name: train(text, [images], poses, steps=steps) for name, (images, poses) in self.presses.items()}
+        return self.run(lambda name, images: known[name]([images]))
 
-    def _trained(self, model: Model) -> list[dict[str, Any]]:
-        known = {name: train(model, *data, epochs=self.suite.epochs) for name, data in self.presses.items()}
-        return self.run(lambda name, images: known[name](images))
-
-    def run(
-        self,
-        estimate: Callable[[str, np.ndarray], np.ndarray] | None,
-        *,
-        shuffle: bool = False,
-        see: bool = True,
-    ) -> list[dict[str, Any]]:
-        """Sums of every kind and condition, by shape; ``estimate`` gives poses from a task's images, None: the true ones.
+    def run(self, estimate: Estimate | None, *, shuffle: bool = False, see: bool = True) -> Cells:
+        """Sums of every kind and condition, by shape; ``estimate`` None: the true pose.
 
         With ``shuffle`` each episode gets the image of the next shape; without ``see`` no image is rendered.
         """
-        cells = []
-        for name, task in TASKS.items():
-            for kind in task.kinds:
-                cells += self._follow(name, kind, estimate, shuffle, see)
-                tick("kinds")
+        cells: Cells = []
+        for kind in self.kinds:
+            cells += self._follow(kind, estimate, shuffle, see)
+            tick("tasks")
         return cells
 
-    def _follow(self, name: str, kind: str, estimate: Any, shuffle: bool, see: bool) -> list[dict[str, Any]]:
+    def _follow(self, kind: str, estimate: Estimate | None, shuffle: bool, see: bool) -> Cells:
         """All episodes of one kind, in step, so that their images are rendered and encoded together."""
-        suite, num = self.suite, self.suite.shapes
+        suite, num, task = self.suite, self.suite.shapes, task_of(kind)
+        name = next(key for key, known in TASKS.items() if known is task)
         asked = [{"new": one.new_sensor, "noise": one.noise} for one in suite.conditions for _ in range(num)]
         episodes = [Episode.begin(suite.seed, kind, i % num, **each) for i, each in enumerate(asked)]
         late = np.repeat([one.latency_ms // STEP_MS for one in suite.conditions], num)
         order = np.arange(len(episodes))
         other = order - order % num + (order + 1) % num  # the next shape under the same condition
-        sums = np.zeros((len(episodes), len(SUMS)))
+        sums, bound = np.zeros((len(episodes), len(self.sums))), suite.most * task.limit
         known: list[np.ndarray] = []
         for step in range(suite.steps):
+            poses = np.stack([episode.pose for episode in episodes])
             if estimate is None:
-                known.append(np.stack([episode.pose for episode in episodes]))
+                known.append(poses)
             else:
-                images = self._touches(kind, asked, episodes) if see else np.zeros((len(episodes), 1, 1, 3), np.uint8)
-                known.append(estimate(name, images[other] if shuffle else images))
+                wanted = [(suite.seed, kind, i % num, asked[i], e.state, e.step) for i, e in enumerate(episodes)]
+                images = np.stack(list(self.map(touch_at, wanted))) if see else np.zeros(len(episodes))
+                known.append(np.broadcast_to(estimate(name, images[other] if shuffle else images), poses.shape))
             for i, episode in enumerate(episodes):
-                away = known[max(0, step - late[i])][i] - episode.task.target
-                bound = suite.most * episode.task.limit
+                away = known[max(0, step - late[i])][i] - task.target
                 episode.move(np.clip(-suite.gain * away, -bound, bound))
                 if step >= suite.settle:
                     sums[i] += (*episode.error(), episode.lost)
         found, n = [], [float(suite.steps - suite.settle)] * num
-        for one, lines in zip(suite.conditions, sums.reshape(-1, num, len(SUMS)), strict=True):
-            each = {key: [float(f"{x:.10g}") for x in line] for key, line in zip(SUMS, lines.T, strict=True)}
+        for one, lines in zip(suite.conditions, sums.reshape(-1, num, len(self.sums)), strict=True):
+            each = {key: [float(f"{x:.10g}") for x in line] for key, line in zip(self.sums, lines.T, strict=True)}
             found.append({"task": kind, "condition": one.name, "n": n, **each})
         return found
 
-    def _touches(self, kind: str, asked: Sequence[dict[str, Any]], episodes: Sequence[Episode]) -> np.ndarray:
-        """The pictures of this moment."""
-        seed, num = self.suite.seed, self.suite.shapes
-        wanted = [
-            (seed, kind, i % num, each, e.state, e.step)
-            for i, (each, e) in enumerate(zip(asked, episodes, strict=True))
-        ]
-        return np.stack(list(self.map(touch_at, wanted)))
+    def impossible(self, task: str, n: np.ndarray, sums: np.ndarray) -> bool:
+        """Whether no episodes give these sums [3, shapes]: steps without contact have the limit."""
+        mm, deg, lost = sums
+        most, fits = task_of(task).limit, (n == self.suite.steps - self.suite.settle).all() and n.shape == mm.shape
+        fits &= len(n) == self.suite.shapes and (lost >= 0).all() and (lost == lost.round()).all()
+        for each, limit in ((mm, most[0]), (deg, np.hypot.reduce(most[1:]))):
+            fits &= bool((each >= lost * limit - 1e-6).all() and (each <= n * limit + 1e-6).all())
+        return not fits
 
-
-def train(model: Model, images: np.ndarray, poses: np.ndarray, *, epochs: int, seed: int = 0) -> Encode:
-    """The network of an external ``model`` with a linear head, both trained: smooth L1 on standardised poses."""
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        trunk = copy.deepcopy(model.encoders["touch"]).train()
-        trunk.network.requires_grad_(True)  # type: ignore[union-attr]
-        head = nn.Linear(trunk.num_features, poses.shape[1])  # type: ignore[arg-type]
-        network = nn.Sequential(trunk, head)
-        x = torch.from_numpy(images).permute(0, 3, 1, 2)
-        mean, std = poses.mean(0), poses.std(0)
-        y = torch.from_numpy((poses - mean) / std).float()
-        weights = [p for p in network.parameters() if p.requires_grad]
-        optimiser = torch.optim.AdamW(weights, lr=1e-3, weight_decay=0.05)
-        steps = epochs * -(-len(x) // 64)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=steps)
-        for _ in range(epochs):
-            for rows in torch.randperm(len(x)).split(64):
-                loss = nn.functional.smooth_l1_loss(network(x[rows]), y[rows])
-                optimiser.zero_grad()
-                loss.backward()
-                optimiser.step()
-                schedule.step()
-    network.eval()
-
-    @torch.no_grad()
-    def estimate(images: np.ndarray) -> np.ndarray:
-        return network(torch.from_numpy(images).permute(0, 3, 1, 2)).numpy() * std + mean
-
-    return estimate
+    def text(self, means: dict[str, np.ndarray], interval: Sequence[float]) -> str:
+        """A cell of a table, of means [seeds, shapes] and the interval of the first of ``sums``."""
+        lost = 100 * means["lost"].mean()
+        most = f"{interval[0]:.2f} [{max(interval[1], 0):.2f}, {interval[2]:.2f}] mm, {means['deg'].mean():.1f}°"
+        return most + (f", {lost:.0f} % lost" if lost >= 0.5 else "")

@@ -22,31 +22,17 @@ class Condition:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ServoSuite:
-    """Tasks of ``control.servo``, one controller, and what estimates its pose (``suites/servo-v1.toml`` says each field)."""
+class LoopSuite:
+    """What both kinds of suite have; their files say what each field means."""
 
     name: str
     title: str
-    kind: Literal["servo"]
     seed: int
-    shapes: int
-    steps: int
-    settle: int
-    gain: float
-    most: float
-    fit_shapes: int
-    fit_presses: int
-    fit_val: int
-    epochs: int
+    train_steps: int
     untrained: tuple[str, ...]
     imagenet: str
-    conditions: tuple[Condition, ...]
     pins: dict[str, str] = field(default_factory=dict)
-    """Digests of the presses by task, where the suite was measured. Not in the digest of the definition."""
-
-    def __post_init__(self) -> None:
-        check_range(self, 2, 1000, "shapes")
-        check_range(self, self.settle + 1, 10_000, "steps")
+    """Digests of what is learned from, where the suite was measured. Not in the digest of the definition."""
 
     def definition(self) -> dict[str, Any]:
         """The suite as JSON, without its pins."""
@@ -56,17 +42,53 @@ class ServoSuite:
         return digest(self.definition())
 
 
+@dataclass(frozen=True, kw_only=True)
+class ServoSuite(LoopSuite):
+    """Tasks of ``control.servo``, one controller, and what estimates its pose."""
+
+    kind: Literal["servo"]
+    shapes: int
+    steps: int
+    settle: int
+    gain: float
+    most: float
+    fit_shapes: int
+    fit_presses: int
+    fit_val: int
+    conditions: tuple[Condition, ...]
+
+    def __post_init__(self) -> None:
+        check_range(self, 2, 1000, "shapes")
+        check_range(self, self.settle + 1, 10_000, "steps")
+
+
+@dataclass(frozen=True, kw_only=True)
+class InsertSuite(LoopSuite):
+    """The task of ``control.insert``, and when it has succeeded."""
+
+    kind: Literal["insert"]
+    episodes: int
+    demonstrations: tuple[int, ...]
+    noise: float
+    success_mm: float
+    success_deg: float
+    success_depth: float
+
+    def __post_init__(self) -> None:
+        check_range(self, 2, 10_000, "episodes")
+
+
 def shipped() -> list[str]:
     """Names of the closed-loop suites of this version."""
     return sorted(path.stem for path in SUITES.glob("*.toml"))
 
 
-def read_suite(value: dict[str, Any]) -> ServoSuite:
+def read_suite(value: dict[str, Any]) -> ServoSuite | InsertSuite:
     """The suite of a JSON object; ValueError if it is none."""
-    return from_json(ServoSuite, value, "suite")
+    return from_json(InsertSuite if value.get("kind") == "insert" else ServoSuite, value, "suite")
 
 
-def find_suite(name: str) -> ServoSuite:
+def find_suite(name: str) -> ServoSuite | InsertSuite:
     """The suite ``name`` of this version."""
     if name not in shipped():
         raise unknown("suite", name, shipped())

@@ -1,0 +1,194 @@
+# mujoco is a binary module without stubs:
+# pyright: reportAttributeAccessIssue=false
+"""Put a peg into a slot: only the gel shows how it is held, with which offset and turn; only the camera shows the slot.
+
+The hand moves in the plane of the gel: x to the right, z up, and a turn about the pad's normal. Its height follows a fixed
+plan (first above the slot, then down), so a policy decides x and turn. MuJoCo computes the contact of peg and slot; the hand
+follows its set point through a soft weld, and the peg does not slip in it. The camera is MuJoCo's ray casting with a lamp;
+a shroud hides the peg from it.
+
+Units: metres and radians inside, mm and degrees in names and results.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mvitac.control.servo import FIELD_MM, SIZE, Copy, Shape, draw_copy, draw_shape, textured, textures
+from mvitac.sim.coordinates import grid
+
+LENGTH_M, DEPTH_M, CLEAR_M = (
+    0.024,
+    0.010,
+    0.0012,
+)  # of the peg below the hand, of the insertion, on each side of the peg
+ABOVE_M, ALIGN, DOWN, SUBSTEPS = 0.016, 9, 9, 40  # height at the start; steps above the slot and down; steps of 2 ms
+DEPTH_MM = 0.8  # of the peg in the gel
+REACH = {"slot_mm": 7.0, "offset_mm": 2.5, "turn_deg": 9.0}
+GAIN, MOST = 0.6, np.array([5.0, 6.0])  # part of the way, and largest change of x (mm) and turn (degrees), in one step
+_TAG, _VIEW = 0x1A5E27, 0x1A5E28
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Peg(Shape):
+    """A bar that crosses the gel, ``half_mm`` wide on each side of its axis."""
+
+    half_mm: float
+    offset_mm: float
+    turn_deg: float
+
+    def inside(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        turn = math.radians(self.turn_deg)
+        return self.half_mm - np.abs(math.cos(turn) * (x - self.offset_mm) + math.sin(turn) * y)
+
+
+@lru_cache(maxsize=4)
+def _held(seed: int) -> tuple[Shape, Copy]:
+    """The surface of the peg, and the gel: the same in all episodes, as in one robot's cell."""
+    rng = np.random.default_rng([_TAG, seed])
+    return draw_shape(rng, "straight", textures(True)), draw_copy(rng, new=False)
+
+
+def draw_peg(seed: int, number: int, trained: bool) -> tuple[Peg, float]:
+    """The peg of an episode in its hand, and the place of the slot in mm."""
+    rng = np.random.default_rng([_TAG, seed, int(trained), number])
+    slot, offset, turn = (float(rng.uniform(-most, most)) for most in REACH.values())
+    known = {key: getattr(_held(seed)[0], key) for key in ("kind", "texture", "roll_mm", "waves")}
+    return Peg(**known, half_mm=3.5, offset_mm=offset, turn_deg=turn), slot
+
+
+class Insertion:
+    """One episode: ``see`` and ``touch`` are all that a policy gets; ``step`` moves the hand."""
+
+    def __init__(self, seed: int, number: int, *, trained: bool = False) -> None:
+        self.key = (seed, int(trained), number)
+        self.peg, self.slot_mm = draw_peg(seed, number, trained)
+        self.model = mujoco.MjModel.from_xml_string(_scene(self.peg, self.slot_mm))
+        self.data = mujoco.MjData(self.model)
+        self.x_mm = self.turn_deg = 0.0
+        self.steps = 0
+        self._go()
+
+    @property
+    def wanted(self) -> np.ndarray:
+        """The set point x (mm) and turn (degrees) with which the peg is upright above the slot: what the expert knows."""
+        turn = -self.peg.turn_deg
+        return np.array([self.slot_mm - self.peg.offset_mm * math.cos(math.radians(turn)), turn])
+
+    @property
+    def over(self) -> bool:
+        return self.steps == ALIGN + DOWN
+
+    def step(self, action: np.ndarray) -> None:
+        """Move towards the set point ``action``, x (mm) and turn (degrees), and go on with the plan."""
+        own = np.array([self.x_mm, self.turn_deg])
+        self.x_mm, self.turn_deg = own + np.clip(GAIN * (action - own), -MOST, MOST)
+        self.steps += 1
+        self._go()
+
+    def touch(self) -> np.ndarray:
+        return touch_of(self.key)
+
+    def see(self) -> np.ndarray:
+        """The camera's picture, uint8 [64, 64, 3]."""
+        return _photograph(self.model, self.data, (*self.key, self.steps))
+
+    def result(self, most_mm: float, most_deg: float, depth: float) -> tuple[bool, float, float]:
+        """Success, and how far the peg is from the slot's axis, in mm at its tip and in degrees."""
+        tip, up = self.data.site_xpos[0], self.data.site_xmat[0].reshape(3, 3)[:, 2]
+        mm, deg = abs(1000 * float(tip[0]) - self.slot_mm), abs(math.degrees(math.atan2(float(up[0]), float(up[2]))))
+        return bool(mm <= most_mm and deg <= most_deg and tip[2] < -depth * DEPTH_M), float(mm), float(deg)
+
+    def _height(self) -> float:
+        down = max(0, self.steps - ALIGN) / DOWN
+        return LENGTH_M + ABOVE_M - down * (ABOVE_M + DEPTH_M)
+
+    def _go(self) -> None:
+        """Move the set point there and let physics follow."""
+        half = math.radians(self.turn_deg) / 2
+        self.data.mocap_pos[0] = self.x_mm / 1000, 0, self._height()
+        self.data.mocap_quat[0] = math.cos(half), 0, math.sin(half), 0
+        mujoco.mj_step(self.model, self.data, SUBSTEPS if self.steps else 1)
+
+
+@lru_cache(maxsize=1024)
+def touch_of(key: tuple[int, int, int]) -> np.ndarray:
+    """What the gel of an episode shows: the grasp does not change, so neither does its picture."""
+    (peg, _), (_, copy) = draw_peg(key[0], key[2], bool(key[1])), _held(key[0])
+    x, y, _ = grid(SIZE, FIELD_MM)
+    return copy.press(DEPTH_MM + peg.height(x, y) + textured(peg, x, y), np.random.default_rng([_TAG, *key, 1]))
+
+
+def photo_of(asked: tuple[tuple[int, int, int], np.ndarray, int]) -> np.ndarray:
+    """``Insertion.see`` for other processes: of an episode, with the state of its physics, at a step."""
+    (seed, trained, number), state, steps = asked
+    world = Insertion(seed, number, trained=bool(trained))
+    world.data.qpos[:] = state
+    mujoco.mj_kinematics(world.model, world.data)
+    world.steps = steps
+    return world.see()
+
+
+def _scene(peg: Peg, slot_mm: float) -> str:
+    """A block with a slot, and the hand at the pad's centre with shroud and peg; the block's top is z = 0."""
+    half, slot = peg.half_mm / 1000, slot_mm / 1000
+    gap, lean = half + CLEAR_M, math.radians(peg.turn_deg)
+    walls = "".join(
+        f'<geom name="block{i}" type="box" size="{w} {d} .01" pos="{x} {y} -.01"/>'
+        for i, (x, y, w, d) in enumerate(
+            (
+                *((slot + side * (gap + 0.015), 0, 0.015, 0.018) for side in (-1, 1)),
+                *((slot, side * 0.0135, gap, 0.0045) for side in (-1, 1)),
+            )
+        )
+    )
+    at, down = peg.offset_mm / 1000, LENGTH_M
+    place = f"{at - math.sin(lean) * down / 2} 0 {-math.cos(lean) * down / 2}"
+    return f"""
+    <mujoco><option timestep=".002" gravity="0 0 0" integrator="implicitfast"/>
+    <default><geom friction=".3" solref=".004 1"/></default>
+    <worldbody>
+      <geom name="table" type="plane" size="1 1 .1" pos="0 0 -.02" contype="0" conaffinity="0"/>
+      {walls}
+      <body name="target" mocap="true" pos="0 0 {LENGTH_M + ABOVE_M}"/>
+      <body name="hand" pos="0 0 {LENGTH_M + ABOVE_M}"><freejoint/>
+        <geom name="shroud" type="box" size=".011 .009 .016" pos="0 0 -.004" contype="0" conaffinity="0" mass=".2"/>
+        <geom name="palm" type="box" size=".02 .012 .006" pos="0 0 .018" contype="0" conaffinity="0" mass=".2"/>
+        <body pos="{place}" euler="0 {peg.turn_deg} 0">
+          <geom name="peg" type="box" size="{half} .004 {down / 2}" group="4" mass=".02"/>
+          <site name="tip" pos="0 0 {-down / 2}"/>
+        </body>
+      </body>
+    </worldbody>
+    <equality><weld body1="hand" body2="target" solref=".02 1"/></equality></mujoco>"""
+
+
+def _photograph(model: Any, data: Any, key: tuple[int, ...]) -> np.ndarray:
+    """One ray per pixel from over the shoulder. Colours are those of one place; the lamp changes between episodes."""
+    rng, own = np.random.default_rng([_VIEW, *key[:3]]), np.random.default_rng([_VIEW, key[0]])
+    eye, ahead = np.array([0.0, -0.13, 0.1]), np.array([0.0, 0.13, -0.095])
+    ahead /= np.linalg.norm(ahead)
+    right = np.array([1.0, 0, 0])
+    up = np.cross(right, ahead)
+    u = ((np.arange(SIZE) + 0.5) / SIZE * 2 - 1) * 0.13
+    rays = (ahead + u[None, :, None] * right - u[:, None, None] * up).reshape(-1, 3)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    count, flat = len(rays), np.ascontiguousarray(rays).ravel()
+    geom, distance, normal = np.full(count, -1, np.int32), np.zeros(count), np.zeros(3 * count)
+    seen = np.array([1, 1, 1, 1, 0, 0], np.uint8)
+    mujoco.mj_multiRay(model, data, eye, flat, seen, True, -1, geom, distance, normal, count, 10.0)
+    table, block, shroud, palm, wall = own.uniform(0.1, 0.9, (5, 3))
+    colours = np.array([table, *[block] * 4, shroud, palm, palm, wall])[geom]
+    lamp = rng.normal((0.2, -0.4, 1.0), 0.3)
+    facing = np.clip(normal.reshape(-1, 3) @ (lamp / np.linalg.norm(lamp)), 0, 1)
+    light = np.where(geom >= 0, rng.uniform(0.2, 0.5) + 0.7 * facing, 1.0)
+    # A slot is dark: its walls and floor below the block's top get less light with their depth.
+    height = eye[2] + rays[:, 2] * distance
+    light *= np.where(np.isin(geom, range(5)) & (height < -1e-4) & (height > -0.0199), np.exp(height / 0.006), 1.0)
+    noise = np.random.default_rng([_VIEW, *key]).normal(0, 2.0, (count, 3))
+    levels = 255 * np.clip(colours * light[:, None], 0, 1) ** (1 / 2.2) + noise
+    return np.clip(levels, 0, 255).astype(np.uint8).reshape(SIZE, SIZE, 3)

@@ -1,0 +1,114 @@
+"""Inserting a peg needs both senses, the camera never shows the peg, and rows score what they say."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from mvitac.bench.encoder import About
+from mvitac.bench.result import VOLATILE
+from mvitac.control import result, suite
+from mvitac.control.insert import Insertion, photo_of
+from mvitac.control.insert_rows import Insert
+from mvitac.control.suite import InsertSuite, find_suite
+from mvitac.system.files import digest
+
+RANDOM = "external:timm/test_resnet,weights=random,size=32,seed={}"
+CRITERIA = (1.0, 3.0, 0.7)
+
+
+@pytest.fixture(scope="module")
+def small() -> InsertSuite:
+    few: Any = {"episodes": 3, "demonstrations": (3, 5), "train_steps": 2, "untrained": (RANDOM.format(0),)}
+    return replace(find_suite("insert-v1"), name="small-v1", **few)  # type: ignore[return-value]
+
+
+def ends(known: Any, num: int = 8) -> np.ndarray:
+    """Success, mm and degrees of episodes in which the hand goes where ``known`` says."""
+    found = []
+    for number in range(num):
+        world = Insertion(0, number)
+        while not world.over:
+            world.step(known(world))
+        found.append(world.result(*CRITERIA))
+    return np.array(found, float)
+
+
+def test_the_expert_succeeds_and_half_of_its_knowledge_does_not() -> None:
+    assert ends(lambda world: world.wanted)[:, 0].all()
+    assert ends(lambda world: np.array([world.slot_mm, 0.0]))[:, 0].mean() < 0.3
+    assert ends(lambda world: world.wanted - [world.slot_mm, 0.0])[:, 0].mean() < 0.3
+
+
+def test_criteria_are_those_of_the_suite() -> None:
+    world = Insertion(0, 1)
+    while not world.over:
+        world.step(world.wanted + np.array([0.5, 0.0]))
+    success, mm, deg = world.result(*CRITERIA)
+    assert success and 0.05 < mm < 0.7
+    assert not world.result(mm / 2, 3.0, 0.7)[0]
+    assert not world.result(1.0, 3.0, 1.2)[0]
+    assert world.result(1.0, deg + 1e-6, 0.7)[0]
+
+
+def test_only_the_camera_shows_the_slot_and_only_the_gel_the_peg() -> None:
+    world = Insertion(0, 3)
+    before, peg = world.see(), world.model.geom("peg").id
+    world.model.geom_size[peg] *= 2
+    mujoco.mj_forward(world.model, world.data)
+    assert np.array_equal(world.see(), before)
+    world.model.geom_pos[world.model.geom("block0").id, 0] += 0.004
+    mujoco.mj_forward(world.model, world.data)
+    assert np.abs(world.see().astype(int) - before).mean() > 1
+    other = Insertion(0, 4)
+    assert np.abs(other.touch().astype(int) - world.touch()).mean() > 1
+    other.step(other.wanted)
+    assert np.array_equal(other.touch(), Insertion(0, 4).touch())
+
+
+def test_other_processes_see_the_same() -> None:
+    world = Insertion(0, 2)
+    for _ in range(5):
+        world.step(world.wanted)
+    assert np.array_equal(photo_of((world.key, world.data.qpos.copy(), world.steps)), world.see())
+
+
+def test_a_result_holds_until_it_is_changed(
+    small: InsertSuite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (result, suite):
+        monkeypatch.setattr(module, "find_suite", lambda _: small)
+    monkeypatch.setattr(result, "shipped", lambda: [small.name])
+    path = result.run_suite([RANDOM.format(5)], small, tmp_path, About(name="five"))
+    value = result.read_control(path)
+    found = result.scores(value)
+    assert found["expert"]["both", "5", "success"].all()
+    assert ("vision", "3", "success") not in found["touch shuffled"]
+    assert not np.array_equal(found["touch shuffled"]["touch", "5", "mm"], found["five"]["touch", "5", "mm"])
+    cell = value["rows"][0]["cells"][0]
+    cell["success"][0], cell["mm"][0] = 1.0, 1.5
+    value["digest"] = digest({key: part for key, part in value.items() if key not in VOLATILE})
+    path.write_text(json.dumps(value))
+    with pytest.raises(ValueError, match="no episodes give"):
+        result.read_control(path)
+
+
+def test_regression_finds_what_pictures_show(small: InsertSuite) -> None:
+    """From images that are the answer itself, the clone is the expert; shuffled touch takes its half of it away."""
+    runner = Insert(replace(small, episodes=4, demonstrations=(6,)))
+    images, actions = runner.demonstrations
+    assert np.ptp(actions.reshape(6, -1, 2), axis=1).max() == 0  # the set point does not change within an episode
+    known = {images[sense][row].tobytes(): actions[row] for sense in images for row in range(len(actions))}
+
+    def oracle(modality: str, pictures: np.ndarray) -> np.ndarray:
+        worlds = {Insertion(0, n).touch().tobytes(): Insertion(0, n).wanted for n in range(4)}
+        return np.stack([known.get(p.tobytes(), worlds.get(p.tobytes(), np.zeros(2))) for p in pictures])
+
+    cells = {cell["task"]: cell for cell in runner._cloned("", oracle)}
+    assert all(cells["touch"]["success"]) and not all(cells["vision"]["success"])
+    shuffled = {cell["task"]: cell for cell in runner._cloned("touch shuffled", oracle)}
+    assert not any(shuffled["touch"]["success"])
