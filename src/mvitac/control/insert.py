@@ -125,12 +125,17 @@ def touch_of(key: tuple[int, int, int]) -> np.ndarray:
 
 def photo_of(asked: tuple[tuple[int, int, int], np.ndarray, int]) -> np.ndarray:
     """``Insertion.see`` for other processes: of an episode, with the state of its physics, at a step."""
-    (seed, trained, number), state, steps = asked
-    world = Insertion(seed, number, trained=bool(trained))
+    key, state, steps = asked
+    world = _world(key)
     world.data.qpos[:] = state
     mujoco.mj_kinematics(world.model, world.data)
     world.steps = steps
     return world.see()
+
+
+@lru_cache(maxsize=128)
+def _world(key: tuple[int, int, int]) -> Insertion:
+    return Insertion(key[0], key[2], trained=bool(key[1]))
 
 
 def _scene(peg: Peg, slot_mm: float) -> str:
