@@ -77,6 +77,21 @@ def test_other_processes_see_the_same() -> None:
     assert np.array_equal(photo_of((world.key, world.data.qpos.copy(), world.steps)), world.see())
 
 
+def test_gymnasium_environment() -> None:
+    gymnasium = pytest.importorskip("gymnasium")
+    from gymnasium.utils.env_checker import check_env
+
+    import mvitac.control.env
+
+    env = gymnasium.make("mvitac/Insert-v1").unwrapped
+    check_env(env, skip_render_check=True)
+    seen, info = env.reset(seed=1)
+    over = False
+    while not over:
+        seen, reward, over, _, info = env.step((env.world.wanted / mvitac.control.env.FARTHEST).astype(np.float32))
+    assert reward == info["success"] == 1 and seen["vision"].shape == seen["touch"].shape
+
+
 def test_a_result_holds_until_it_is_changed(
     small: InsertSuite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -111,7 +111,7 @@ def lerobot_policy(folder: Path) -> Policy:
         batch: dict[str, Any] = {"task": ""}
         for key in policy.config.image_features:
             image = observation["touch" if FELT.search(key) else "vision"]
-            batch[key] = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None] / 255
+            batch[key] = torch.from_numpy(np.array(image)).permute(2, 0, 1)[None] / 255
         if "observation.state" in policy.config.input_features:
             batch["observation.state"] = torch.from_numpy(np.float32(observation["state"]))[None]
         with torch.no_grad():

@@ -11,8 +11,11 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from mvitac.control.insert import Insertion
 from mvitac.control.servo import SIZE, Episode, task_of
 from mvitac.control.suite import find_suite
+
+FARTHEST = np.array([20.0, 30.0])  # set points of an insertion, in mm and degrees
 
 
 class ServoEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
@@ -27,8 +30,8 @@ class ServoEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     render_mode = "rgb_array"
 
     def __init__(self, kind: str = "straight", *, new_sensor: bool = False, noise: float = 1.0) -> None:
-        self.suite, self.kind = find_suite("servo-v1"), kind
-        self.task, self.asked = task_of(kind), {"new": new_sensor, "noise": noise}
+        self.suite: Any = find_suite("servo-v1")
+        self.kind, self.task, self.asked = kind, task_of(kind), {"new": new_sensor, "noise": noise}
         self.observation_space = spaces.Dict({"touch": spaces.Box(0, 255, (SIZE, SIZE, 3), np.uint8)})
         self.action_space = spaces.Box(-1, 1, (len(self.task.names),), np.float32)
 
@@ -55,4 +58,41 @@ class ServoEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         return {"pose": self.episode.pose, "mm": mm, "deg": deg}
 
 
+class InsertEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
+    """Insert one peg of ``insert-v1``; seeds 0 to 29 of ``reset`` are the episodes of the suite.
+
+    An action in [-1, 1] is the set point of x and turn, in parts of ``FARTHEST``. The reward is 1 at the end
+    if the insertion succeeds; then ``info`` has success, mm and deg.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012 - gymnasium's name and type
+    render_mode = "rgb_array"
+
+    def __init__(self) -> None:
+        self.suite: Any = find_suite("insert-v1")
+        picture = spaces.Box(0, 255, (SIZE, SIZE, 3), np.uint8)
+        self.observation_space = spaces.Dict({"vision": picture, "touch": picture})
+        self.action_space = spaces.Box(-1, 1, (2,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        self.world = Insertion(self.suite.seed, int(self.np_random.integers(2**31)) if seed is None else seed)
+        return self._seen(), {}
+
+    def step(self, action: np.ndarray) -> Any:
+        self.world.step(FARTHEST * np.asarray(action, float))
+        if not self.world.over:
+            return self._seen(), 0.0, False, False, {}
+        asked = self.suite.success_mm, self.suite.success_deg, self.suite.success_depth
+        info = dict(zip(("success", "mm", "deg"), self.world.result(*asked), strict=True))
+        return self._seen(), float(info["success"]), True, False, info
+
+    def render(self) -> np.ndarray:  # type: ignore[override]
+        return self.world.see()
+
+    def _seen(self) -> dict[str, np.ndarray]:
+        return {"vision": self.world.see(), "touch": self.world.touch().copy()}
+
+
 gymnasium.register("mvitac/Servo-v1", entry_point=ServoEnv)
+gymnasium.register("mvitac/Insert-v1", entry_point=InsertEnv)
