@@ -125,7 +125,7 @@ def act(policy: Policy, episodes: Episodes, sense: str = "", kind: str = "", lag
     """Actions [N, T] of ``policy`` in every row, with ``sense`` replaced by ``kind`` of ``KINDS``; NaN where no row is."""
     found = np.full(episodes.actions.shape, np.nan)
     names = list(episodes.rows)
-    images = episodes.pack.images
+    images, mean, spread = episodes.pack.images, np.zeros((1, 1, 3)), np.ones(3)
     if kind in ("mean frame", "noise"):
         every = np.concatenate([np.asarray(images[sense][rows], np.float32) for rows in episodes.rows.values()])
         mean, spread = every.mean(0), every.std((0, 1, 2))

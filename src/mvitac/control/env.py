@@ -32,8 +32,8 @@ class ServoEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     def __init__(self, kind: str = "straight", *, new_sensor: bool = False, noise: float = 1.0) -> None:
         self.suite: Any = find_suite("servo-v1")
         self.kind, self.task, self.asked = kind, task_of(kind), {"new": new_sensor, "noise": noise}
-        self.observation_space = spaces.Dict({"touch": spaces.Box(0, 255, (SIZE, SIZE, 3), np.uint8)})
-        self.action_space = spaces.Box(-1, 1, (len(self.task.names),), np.float32)
+        self.observation_space: Any = spaces.Dict({"touch": spaces.Box(0, 255, (SIZE, SIZE, 3), np.uint8)})
+        self.action_space: Any = spaces.Box(-1, 1, (len(self.task.names),), np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         super().reset(seed=seed)
@@ -71,8 +71,8 @@ class InsertEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     def __init__(self) -> None:
         self.suite: Any = find_suite("insert-v1")
         picture = spaces.Box(0, 255, (SIZE, SIZE, 3), np.uint8)
-        self.observation_space = spaces.Dict({"vision": picture, "touch": picture})
-        self.action_space = spaces.Box(-1, 1, (2,), np.float32)
+        self.observation_space: Any = spaces.Dict({"vision": picture, "touch": picture})
+        self.action_space: Any = spaces.Box(-1, 1, (2,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         super().reset(seed=seed)
@@ -94,5 +94,5 @@ class InsertEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         return {"vision": self.world.see(), "touch": self.world.touch().copy()}
 
 
-gymnasium.register("mvitac/Servo-v1", entry_point=ServoEnv)
-gymnasium.register("mvitac/Insert-v1", entry_point=InsertEnv)
+gymnasium.register("mvitac/Servo-v1", entry_point=f"{__name__}:ServoEnv")
+gymnasium.register("mvitac/Insert-v1", entry_point=f"{__name__}:InsertEnv")

@@ -35,11 +35,10 @@ _TAG, _VIEW = 0x1A5E27, 0x1A5E28
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Peg(Shape):
-    """A bar that crosses the gel, ``half_mm`` wide on each side of its axis."""
+    """A bar that crosses the gel, ``half_mm`` wide on each side of its axis, which is turned by ``turn_deg``."""
 
     half_mm: float
     offset_mm: float
-    turn_deg: float
 
     def inside(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         turn = math.radians(self.turn_deg)

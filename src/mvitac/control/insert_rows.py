@@ -95,9 +95,10 @@ class Insert:
             rows = np.arange(num * (ALIGN + DOWN))
             if encode is None:
                 return lambda _: np.tile(actions[rows].mean(0), (self.suite.episodes, 1))
+            read = encode
             x = np.concatenate([known[sense][rows] for sense in senses], axis=1)
             fitted, _ = fit_ridge(x, actions[rows], max(2, num // 5) * (ALIGN + DOWN))
-            return lambda seen: fitted(np.concatenate([encode(sense, seen[sense]) for sense in senses], axis=1))
+            return lambda seen: fitted(np.concatenate([read(sense, seen[sense]) for sense in senses], axis=1))
 
         return self._all(source, fit)
 
