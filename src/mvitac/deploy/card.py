@@ -5,6 +5,7 @@ from typing import Any
 
 import jinja2
 
+from mvitac.data.spec import listed
 from mvitac.evaluation.score_text import cell_text, columns_of, covered, pipes, score_name, sources_of, tested_on
 from mvitac.model import Model
 from mvitac.nn.linear_probe import ValueInfo
@@ -39,6 +40,7 @@ def card(model: Model, about: dict[str, Any]) -> str:
             covered=covered(scores["group_by"], [{"source": "run", "seed": 0}]),
             given=about["preprocessing"],
             start=about["start"],
+            listed=listed,
         )
 
 
