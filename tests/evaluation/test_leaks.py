@@ -247,7 +247,7 @@ def test_rows_of_two_joined_packs_keep_their_ids(pack: Pack, turned: Pack) -> No
 
 def test_summaries_and_folds_keep_the_leak() -> None:
     record = {"source": "a", "seed": 0, "task": "t", "modality": "touch", "probe": "linear", "num_test": 2}
-    record |= {"group_sizes": [1, 1], "group_correct": [1, 0], "confusion": [[1, 0], [1, 0]]}
+    record |= {"group_sizes": [1, 1], "group_correct": [1, 0], "confusion": [[1, 0], [1, 0]], "class_groups": [1, 1]}
     record |= {"balanced_accuracy": None, "macro_f1": None, "auroc": None}
     (pooled,) = pool([[{**record, "leak": ""}], [{**record, "leak": "seen"}]])
     assert pooled["leak"] == "seen" and "leak" not in pool([[record], [record]])[0]

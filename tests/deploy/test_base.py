@@ -1,0 +1,33 @@
+"""The model that the package brings: found by its name, whole, and with the leaks of its training known."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mvitac
+from mvitac.evaluation.leaks import read_sources
+from mvitac.shipped import BASE, named, with_names
+from mvitac.training.start import read_start
+
+
+def test_base_answers_offline_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    model = mvitac.load("base")
+    image = np.random.default_rng(0).integers(0, 255, (90, 120, 3), np.uint8)
+    found = model.embed(vision=image, touch=image)
+    assert {m: value.shape for m, value in found.items()} == {"vision": (1, 1280), "touch": (1, 512)}
+    assert all(value.isfinite().all() for value in found.values()) and set(model.probes)
+    assert read_sources(BASE) and (BASE / "model.safetensors").stat().st_size < 25e6
+    (tmp_path / "base").mkdir()
+    assert named("base") == "base"  # what is here has the name
+
+
+def test_commands_know_base(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["base", "--init", "base", "--name", "base", "--on", "base"]
+    assert with_names(words) == [str(BASE), "--init", str(BASE), *words[3:]]
+    run = replace(mvitac.recipe("locked"), init=mvitac.Init(path=Path("base")))
+    start = read_start(run.init)
+    assert start is not None and set(start.trunks) == {"vision", "touch"}
