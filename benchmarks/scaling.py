@@ -17,7 +17,7 @@ from benchmarks.speed import Scale, interleave, our_run
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Views
 from mvitac.system.device import pick_device
-from mvitac.system.distributed import World, join, local_device, synchronise_norms
+from mvitac.system.distributed import World, join, local_device
 from mvitac.training.step import Step
 
 
@@ -41,7 +41,7 @@ def main() -> None:
     for name, size in (("alone", World()), ("together", world)):
         run = replace(our_run(scale, "bf16"), batch_size=options.batch * size.size)
         method = run.method.build(spec, run.encoder).to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        step = Step(run, synchronise_norms(method.train(), size), device, size)  # type: ignore[arg-type]
+        step = Step(run, method.train(), device, size)  # type: ignore[arg-type]
         variants[name] = lambda step=step: step([lambda: batch], lr=1e-3, seed=0, progress=0.5)
     seconds = interleave(variants, options.rounds, device)
     if world.writes:

@@ -154,7 +154,7 @@ def test_moco_contrasts_with_the_queue_then_fills_it() -> None:
     queues = {m: queue.keys.clone() for m, queue in method.queues.items()}
     found = outcome(method, batch)
     for modality in ("vision", "touch"):
-        q = method.query[modality](batch.images[modality][0])
+        q = method.towers[modality](batch.images[modality][0])
         expected = queue_nce(q, keys[modality], queues[modality], 0.2)
         torch.testing.assert_close(found[modality], expected)
     before = copy.deepcopy(method.key.state_dict())
@@ -162,7 +162,7 @@ def test_moco_contrasts_with_the_queue_then_fills_it() -> None:
     for modality, queue in method.queues.items():
         torch.testing.assert_close(queue.keys[:8], F.normalize(keys[modality], dim=1))
         assert torch.equal(queue.keys[8:], queues[modality][8:]) and int(queue.place) == 8
-    query = method.query.state_dict()
+    query = method.towers.state_dict()
     for name, value in method.key.state_dict().items():
         q = query[name.replace(".module.", ".")]
         expected = 0.999 * before[name] + 0.001 * q if value.is_floating_point() else q
@@ -181,7 +181,7 @@ def test_queues_and_negatives_are_a_share_of_the_rows() -> None:
 def test_mct_crosses_modalities_through_the_inter_heads() -> None:
     method = build("mct")
     batch = views(method)
-    towers, queues = method.towers, {n: q.keys.clone() for n, q in method.queues.items()}  # type: ignore[union-attr]
+    towers, queues = method, {n: q.keys.clone() for n, q in method.queues.items()}  # type: ignore[union-attr]
     query = {m: towers.query[m](v[0]) for m, v in batch.images.items()}
     key = {m: towers.key[m](v[1]) for m, v in batch.images.items()}
     found = outcome(method, batch)
@@ -208,7 +208,7 @@ def test_byol_both_ways_round() -> None:
     batch = views(method)
     found = outcome(method, batch)
     a, b = batch.images["touch"]
-    online, predict, target = method.online["touch"], method.predictor["touch"], method.target["touch"]  # type: ignore
+    online, predict, target = method.towers["touch"], method.predictor["touch"], method.target["touch"]  # type: ignore
     with torch.no_grad():
         expected = distance(predict(online(a)), target(b)) + distance(predict(online(b)), target(a))
     assert float(found["touch"].detach()) == pytest.approx(expected, rel=1e-4)
@@ -236,7 +236,7 @@ def test_dino_equals_a_direct_transcription() -> None:
             with torch.no_grad():
                 s, t = (
                     [tower[modality](view).tolist() for view in batch.images[modality]]
-                    for tower in (method.student, method.teacher)
+                    for tower in (method.towers, method.teacher)
                 )
             total = 0.0
             for mine, other in ((0, 1), (1, 0)):

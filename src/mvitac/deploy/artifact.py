@@ -22,6 +22,7 @@ from mvitac import model_files
 from mvitac.deploy.sealed_folder import SealedFolder
 from mvitac.evaluation.encoders import is_encoder, open_encoder
 from mvitac.model import Model
+from mvitac.nn.encoders import num_features
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.nn.weights import read_safetensors
 from mvitac.registry import from_json, to_json
@@ -38,14 +39,12 @@ ARTIFACT = SealedFolder(
 )
 AS_GIVEN = "none is subtracted: tactile images are used as the sensor gives them"
 SUBTRACTED = (
-    "subtracted: touch is (touch - background) / 2 + 128, the background being what the sensor shows without contact;"
-    " `mvitac live` learns it and does this, `embed` and `predict` do it given background=..., whoever calls an export"
-    " does it first"
+    "subtracted: touch is (touch - background) / 2 + 128, the background being the sensor without contact; `mvitac live`"
+    " does this itself, `embed` and `predict` given background=..., and whoever calls an export does it first"
 )
 LAYOUT = (
-    "channels are those of the newest frame first, then of older ones; frames are `stride` units of column `order` apart"
-    " (time: seconds, else: frames); at the start of a touch its first frame repeats; minus_first: each frame is"
-    " (frame - first frame of the touch) / 2 + 128"
+    "channels of the newest frame first; frames are `stride` units of column `order` apart (time: seconds); at the start"
+    " of a touch its first frame repeats; minus_first: (frame - first frame of the touch) / 2 + 128"
 )
 HUB_ID = re.compile(r"(?P<repo>[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)(@(?P<revision>[\w./-]+))?")
 
@@ -146,22 +145,14 @@ def read(folder: Path) -> PublishedModel:
         for name in ("colour_order", "mean", "std", "stored", "size", "channels", "window"):
             if given.get(name) != asked.get(name):
                 raise ValueError(f"{folder}: {name} is {given.get(name)}, its model was trained with {asked.get(name)}")
-        model.probes = read_probes(folder, about, model)
+        classes = from_json(tuple[ProbeInfo, ...], about["probes"], "probes")
+        values = from_json(tuple[ValueInfo, ...], about["values"], "values")
+        path = folder / "probes.safetensors"
+        tensors = read_safetensors(path)[1] if classes or values else {}
+        for info in (*classes, *values):
+            probe = LinearProbe(info, *(tensors[f"{info.name}.{part}"] for part in info.parts))
+            dim, reads = sum(num_features(model.encoders[m]) for m in info.modalities), probe.weight.shape[1]
+            if reads != dim:
+                raise ValueError(f"{path}: probe {info.name} reads {reads} features, the model gives {dim}")
+            model.probes[info.name] = probe
     return PublishedModel(model, folder).eval()
-
-
-def read_probes(folder: Path, about: dict[str, Any], model: Model) -> dict[str, LinearProbe]:
-    """The probes of ``folder`` by name; ValueError if names, shapes or classes do not fit the model."""
-    classes: tuple[ProbeInfo, ...] = from_json(tuple[ProbeInfo, ...], about["probes"], "probes")
-    values: tuple[ValueInfo, ...] = from_json(tuple[ValueInfo, ...], about["values"], "values")
-    if not (classes or values):
-        return {}
-    path, probes = folder / "probes.safetensors", {}
-    _, tensors = read_safetensors(path)
-    for info in (*classes, *values):
-        dim = sum(int(model.encoders[m].num_features) for m in info.modalities)  # type: ignore[arg-type]
-        probe = LinearProbe(info, *(tensors[f"{info.name}.{part}"] for part in info.parts))
-        if probe.weight.shape[1] != dim:
-            raise ValueError(f"{path}: probe {info.name} reads {probe.weight.shape[1]} features, the model gives {dim}")
-        probes[info.name] = probe
-    return probes

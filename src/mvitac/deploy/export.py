@@ -28,7 +28,6 @@ from mvitac.evaluation.features import sample
 from mvitac.evaluation.sensors import learn_looks
 from mvitac.model import Model
 from mvitac.system.device import has_bf16
-from mvitac.system.files import write_atomic
 from mvitac.system.locks import new_folder
 from mvitac.system.progress import work
 from mvitac.system.provenance import provenance
@@ -57,7 +56,7 @@ def export(
     if the export is not possible, or differs by more than ``config`` allows.
     """
     if config.precision == "bf16" and not has_bf16(torch.device("cpu")):
-        raise ValueError("--precision bf16: this CPU does not compute bf16 itself, so the export could not be checked")
+        raise ValueError("--precision bf16: this CPU does not compute bf16 itself, so it could not be checked")
     asked = tuple(sorted(config.modalities, reverse=True)) or tuple(model.encoders)  # vision, touch
     known, pack = pack, new or pack
     if new and "touch" not in asked:
@@ -69,7 +68,7 @@ def export(
     if new and not len(rows):
         rows = np.flatnonzero(np.logical_and.reduce([new.has(modality) for modality in asked]))
     if not len(rows):
-        raise ValueError(f"{pack.path} has no rows in split test, which no probe was fitted on, to check the export")
+        raise ValueError(f"{pack.path} has no rows in split test to check the export on")
     rows = sample(rows, config.num_rows)
     with new_folder(out) as partial:
         with work("writing ONNX"), silent():
@@ -77,8 +76,20 @@ def export(
             if config.precision == "int8":
                 quantise(partial / MODEL, list(graph.inputs), _examples(graph, calibrate or pack))
         report, wanted = _measure(model, graph, partial / MODEL, pack, rows, config)
-        _write_check(graph, partial, pack, rows, wanted)
-        EXPORT.write(partial, _about(model, graph, config, report))
+        # A few real inputs and the outputs of the trained model, which ``Engine`` repeats where it is opened.
+        some = np.linspace(0, len(rows) - 1, min(len(rows), NUM_CHECK)).astype(int)
+        check = {f"input_{m}": pack.images[m][rows[some]] for m in graph.modalities}
+        check |= {name: values[some] for name, values in wanted.items()}
+        data = safetensors.numpy.save({name: np.ascontiguousarray(values) for name, values in check.items()})
+        (partial / CHECK).write_bytes(data)
+        about = {
+            "precision": config.precision,
+            "inputs": {m: list(shape) for m, shape in graph.inputs.items()},
+            **{"outputs": list(graph.outputs), "classes": graph.classes, "values": graph.values},
+            "preprocessing": preprocessing(model) | ({"new_sensor": graph.looks.about()} if graph.looks else {}),
+            **{"weights": model.weights_digest(), "tolerance": config.tolerance, "report": report},
+        }
+        EXPORT.write(partial, {**about, "provenance": provenance()})
     return report
 
 
@@ -98,33 +109,6 @@ def _examples(graph: ExportModule, pack: Pack) -> list[list[np.ndarray]]:
     if not len(rows):
         raise ValueError(f"{pack.path} has no rows in split train: int8 takes its ranges from them")
     return [[pack.images[m][r : r + 1] for m in graph.modalities] for r in sample(rows, NUM_CALIBRATION)]
-
-
-def _write_check(
-    graph: ExportModule, folder: Path, pack: Pack, rows: np.ndarray, wanted: dict[str, np.ndarray]
-) -> None:
-    """A few real inputs and the outputs of the trained model, which ``Engine`` repeats where it is opened."""
-    some = np.linspace(0, len(rows) - 1, min(len(rows), NUM_CHECK)).astype(int)
-    check = {f"input_{m}": pack.images[m][rows[some]] for m in graph.modalities}
-    check |= {name: values[some] for name, values in wanted.items()}
-    data = safetensors.numpy.save({name: np.ascontiguousarray(values) for name, values in check.items()})
-    write_atomic(folder / CHECK, lambda file: file.write(data))
-
-
-def _about(model: Model, graph: ExportModule, config: ExportConfig, report: dict[str, Any]) -> dict[str, Any]:
-    """What export.json says, besides the files."""
-    return {
-        "precision": config.precision,
-        "inputs": {m: list(shape) for m, shape in graph.inputs.items()},
-        "outputs": list(graph.outputs),
-        "classes": graph.classes,
-        "values": graph.values,
-        "preprocessing": preprocessing(model) | ({"new_sensor": graph.looks.about()} if graph.looks else {}),
-        "weights": model.weights_digest(),
-        "tolerance": config.tolerance,
-        "report": report,
-        "provenance": provenance(),
-    }
 
 
 @contextlib.contextmanager

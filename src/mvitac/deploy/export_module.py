@@ -60,9 +60,16 @@ class ExportModule(nn.Module):
         self.encoders = nn.ModuleDict({m: model.encoders[m] for m in self.modalities})
         self.projectors = nn.ModuleDict({m: p for m, p in model.projectors.items() if m in self.modalities})
         self.probes = nn.ModuleList([r for r in model.probes.values() if r.info.modality == asked])
-        infos = [r.info for r in self.probes]
+        infos: list[Any] = [r.info for r in self.probes]
         self.classes = {q.task: list(q.classes) for q in infos if isinstance(q, ProbeInfo)}
-        self.values = {q.task: _targets(q) for q in infos if isinstance(q, ValueInfo)}
+        self.values = {
+            q.task: [
+                {"name": t.name, "unit": t.unit, "edges": list(e.edges), "spread": list(e.spread)}
+                for t, e in zip(q.targets, q.errors, strict=True)
+            ]
+            for q in infos
+            if isinstance(q, ValueInfo)
+        }
         self.inputs = {m: (model.stored, model.stored, model.spec.channels(m)) for m in self.modalities}
         self.outputs = tuple(
             [f"embedding_{m}" for m in self.modalities]
@@ -82,19 +89,17 @@ class ExportModule(nn.Module):
         self.eval()
 
     def encode(self, modality: str, images: Tensor, view: nn.Module) -> Tensor:
-        """Features [B, D] of uint8 [B, S, S, C]."""
+        """Features [B, D] of uint8 [B, S, S, C]; of a new sensor in the colours of each of L known ones, averaged."""
         if not (self.looks and modality == "touch"):
             return self.encoders[modality](view(images))
-        found = self.encoders[modality](view(self.recoloured(images)))
-        return found.reshape(len(self.mixing), -1, found.shape[1]).mean(0)
-
-    def recoloured(self, images: Tensor) -> Tensor:
-        """The new sensor's images [B, S, S, 3] in the colours of each known one, [L B, S, S, 3] in whole grey levels."""
         levels = images.float()
         slopes = levels - levels.mean((1, 2), keepdim=True) - self.lamps
         # A difference, because int8 exports round what is added.
         shown = [slopes @ mixing - ground for mixing, ground in zip(self.mixing, self.minus_ground, strict=True)]
-        return torch.cat(shown).round().clamp(0, 255)
+        found = self.encoders[modality](
+            view(torch.cat(shown).round().clamp(0, 255))
+        )  # whole grey levels [L B, S, S, 3]
+        return found.reshape(len(self.mixing), -1, found.shape[1]).mean(0)
 
     def forward(self, *images: Tensor) -> tuple[Tensor, ...]:
         """The outputs, in the order of ``outputs``, of the images, in the order of ``modalities``."""
@@ -128,12 +133,6 @@ def output_of(probe: LinearProbe) -> str:
     """The name of the output of a probe."""
     kind = "probability" if isinstance(probe.info, ProbeInfo) else "value"
     return f"{kind}_{probe.info.task}"
-
-
-def _targets(info: ValueInfo) -> list[dict[str, Any]]:
-    """Name, unit, and errors by range of the predicted value (``Error``) of each target, JSON-ready."""
-    named = zip(info.targets, info.errors, strict=True)
-    return [{"name": t.name, "unit": t.unit, "edges": list(e.edges), "spread": list(e.spread)} for t, e in named]
 
 
 def _filter(size: int, stored: int) -> Tensor:

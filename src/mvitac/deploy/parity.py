@@ -21,15 +21,13 @@ def reference(
     for chunk in np.array_split(rows, max(1, len(rows) // 64)):
         images = {m: pack.images[m][chunk] for m in graph.modalities}
         shown = {m: graph.looks(x) if graph.looks and m == "touch" else [x] for m, x in images.items()}
-
-        def mean(modality: str, shown: dict[str, list[np.ndarray]] = shown, **asked: bool) -> torch.Tensor:
-            each = [torch.from_numpy(look).permute(0, 3, 1, 2) for look in shown[modality]]
-            return torch.stack([model.features(modality, look, **asked) for look in each]).mean(0)
-
-        features = {m: mean(m) for m in images}
-        joined = torch.cat([features[m] for m in ("vision", "touch") if m in features], dim=1)
+        looks = {m: [torch.from_numpy(x).permute(0, 3, 1, 2) for x in each] for m, each in shown.items()}
+        features = {m: torch.stack([model.features(m, x) for x in each]).mean(0) for m, each in looks.items()}
         found = {f"embedding_{m}": x for m, x in features.items()}
-        found |= {f"shared_{m}": model.project(m, mean(m, for_heads=True)) for m in graph.projectors}
+        for m in graph.projectors:
+            wide = torch.stack([model.features(m, x, for_heads=True) for x in looks[m]]).mean(0)
+            found[f"shared_{m}"] = model.project(m, wide)
+        joined = torch.cat([features[m] for m in ("vision", "touch") if m in features], dim=1)
         found |= {output_of(r): r(joined) for r in graph.probes}  # type: ignore[arg-type]
         chunks.append(found)
         advance(len(chunk))
@@ -66,53 +64,42 @@ def parity(
             how = f"{name} has cosine {values.min():.4f} on real inputs, at least {min_cosine} is allowed (min_cosine)"
             raise ValueError(f"the export is not the trained model: {how}")
     for task, known in graph.classes.items():
-        labels = labels_of(pack, task, known, rows)
-        if (labels >= 0).any():
-            name = f"probability_{task}"
-            report["accuracy"][task] = _accuracy(task, labels, wanted[name], found[name], accuracy_loss)
+        labels, name = labels_of(pack, task, known, rows), f"probability_{task}"
+        if not (labels >= 0).any():
+            continue
+        right = [(x[name].argmax(1) == labels)[labels >= 0] for x in (wanted, found)]
+        before, after = (100 * float(x.mean()) for x in right)
+        if not before - after <= accuracy_loss:
+            how = f"accuracy on {task} from {before:.1f} to {after:.1f} % of {len(right[0])} rows"
+            raise ValueError(f"the export lowers {how}, at most {accuracy_loss} points are allowed (--accuracy-loss)")
+        report["accuracy"][task] = {"original": before, "export": after, "num": len(right[0])}
     for task, targets in graph.values.items():
-        name, measured = f"value_{task}", [_measured(pack, target["name"], target["unit"], rows) for target in targets]
-        columns = zip(targets, measured, wanted[name].T, found[name].T, strict=True)
-        report["values"][task] = [_error(*column, value_loss) for column in columns]
+        columns = zip(targets, wanted[f"value_{task}"].T, found[f"value_{task}"].T, strict=True)
+        report["values"][task] = [_error(pack, rows, *column, value_loss) for column in columns]
     return report
 
 
-def _measured(pack: Pack, name: str, unit: str, rows: np.ndarray) -> np.ndarray:
-    """Measured values [len(rows)] of one target; NaN where ``pack`` has none in this unit."""
-    for task in pack.spec.values:
-        for t, target in enumerate(task.targets):
-            if (target.name, target.unit) == (name, unit):
-                return pack.values(task)[rows, t]
-    return np.full(len(rows), np.nan)
-
-
 def _error(
-    target: dict[str, Any], true: np.ndarray, wanted: np.ndarray, found: np.ndarray, limit: float
+    pack: Pack, rows: np.ndarray, target: dict[str, Any], wanted: np.ndarray, found: np.ndarray, limit: float
 ) -> dict[str, Any]:
     """What an export does to one target, in its unit; ValueError if values change by more than ``limit`` deviations.
 
-    The deviation is that of the measured values, or of the model's own where fewer than two were measured.
+    The deviation is that of the measured values, or of the model's own where fewer than two were measured in this unit.
     """
+    name, unit, true = target["name"], target["unit"], np.full(len(rows), np.nan)
+    for task in pack.spec.values:
+        for t, known in enumerate(task.targets):
+            if (known.name, known.unit) == (name, unit):
+                true = pack.values(task)[rows, t]
     have = ~np.isnan(true)
     std = float((true[have] if have.sum() > 1 else wanted).std())
     change, allowed = float(((found - wanted) ** 2).mean() ** 0.5), limit * std
     if not change <= allowed:
-        how = f"by {change:.3g} {target['unit']} (root mean square), at most {allowed:.3g} is allowed (--value-loss)"
-        raise ValueError(f"the export changes {target['name']} {how}")
-    maes = [float(abs(x - true)[have].mean()) if have.any() else None for x in (wanted, found)]
-    return {
-        **{key: target[key] for key in ("name", "unit")},
-        **{"original": maes[0], "export": maes[1], "num": int(have.sum()), "change": change, "allowed": allowed},
-    }
-
-
-def _accuracy(task: str, labels: np.ndarray, wanted: np.ndarray, found: np.ndarray, limit: float) -> dict[str, Any]:
-    """Accuracy in percent before and after, over labelled rows; ValueError if more than ``limit`` points are lost."""
-    before, after = (100 * float((x.argmax(1) == labels)[labels >= 0].mean()) for x in (wanted, found))
-    if not before - after <= limit:
-        how = f"accuracy on {task} from {before:.1f} to {after:.1f} % of {(labels >= 0).sum()} rows"
-        raise ValueError(f"the export lowers {how}, at most {limit} points are allowed (--accuracy-loss)")
-    return {"original": before, "export": after, "num": int((labels >= 0).sum())}
+        how = f"by {change:.3g} {unit} (root mean square), at most {allowed:.3g} is allowed (--value-loss)"
+        raise ValueError(f"the export changes {name} {how}")
+    before, after = (float(abs(x - true)[have].mean()) if have.any() else None for x in (wanted, found))
+    errors = {"original": before, "export": after, "num": int(have.sum()), "change": change, "allowed": allowed}
+    return {"name": name, "unit": unit, **errors}
 
 
 def labels_of(pack: Pack, task: str, classes: list[str], rows: np.ndarray) -> np.ndarray:

@@ -29,6 +29,7 @@ class ImageFeatures(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstim
 
     Attributes:
         model_: The loaded model.
+        names_: Its modalities, in the order of their features.
 
     Examples:
         >>> ImageFeatures("artifacts/mine").fit_transform(["a.png", "b.png"]).shape  # doctest: +SKIP
@@ -52,9 +53,10 @@ class ImageFeatures(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstim
             ValueError: If there is no such model, or it has no such encoder.
         """
         self.model_ = self.model if isinstance(self.model, Model) else load(self.model)
-        for name in self._names():
+        self.names_ = ("vision", "touch") if self.modality == "both" else (self.modality,)
+        for name in self.names_:
             self.model_.check_modality(name)
-        self._n_features_out = sum(num_features(self.model_.encoders[m]) for m in self._names())
+        self._n_features_out = sum(num_features(self.model_.encoders[m]) for m in self.names_)
         return self
 
     def transform(self, X: Sequence[Any] | np.ndarray) -> np.ndarray:
@@ -71,18 +73,13 @@ class ImageFeatures(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstim
             ValueError: If images do not fit the model.
         """
         check_is_fitted(self)
-        names = self._names()
+        names = self.names_
         if hasattr(X, "columns"):
             columns = [list(X[name]) for name in names]  # type: ignore[call-overload]
         elif self.modality == "both":
-            if any(not hasattr(pair, "__len__") or len(pair) != 2 or isinstance(pair, str) for pair in X):
-                raise ValueError("modality 'both' takes pairs (vision, touch): give a list of them, or two columns")
             columns = [[pair[i] for pair in X] for i in (0, 1)]
         else:
             columns = [X]
         given: dict[str, Any] = dict(zip(names, columns, strict=True))
         features = self.model_.embed(**given, background=self.background)
         return np.concatenate([features[name].cpu().numpy() for name in names], axis=1)
-
-    def _names(self) -> tuple[str, ...]:
-        return ("vision", "touch") if self.modality == "both" else (self.modality,)

@@ -75,15 +75,11 @@ class Embeddings:
             about = json.loads(self.table.schema.metadata[ABOUT])
             self.shared, self.pack, self.pack_digest = about["shared"], Path(about["pack"]), about["pack_digest"]
             self.classes = from_json(dict[str, tuple[str, ...]], about["classes"], "classes")
-            self.banks = {m: self._unit(m) for m in ("vision", "touch") if m in self.table.column_names}
+            columns = {m: self.table.column(m) for m in ("vision", "touch") if m in self.table.column_names}
+            given = {m: column.combine_chunks().flatten().to_numpy() for m, column in columns.items()}
+            self.banks = {m: unit(x.reshape(self.table.num_rows, -1)) for m, x in given.items()}
             if about["weights"] != weights:
                 raise ValueError(f"{file} was embedded by another model: embed the pack again")
-
-    def _unit(self, modality: str) -> np.ndarray:
-        """Unit vectors [N, D]; NaN stays."""
-        values = self.table.column(modality).combine_chunks().flatten().to_numpy()
-        x = values.reshape(self.table.num_rows, -1)
-        return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
 
     def find(
         self,
@@ -105,7 +101,7 @@ class Embeddings:
         if source != target and not self.shared:
             raise ValueError(f"{self.file} holds features, where {source} finds no {target}: embed with --shared")
         x = model.embed(**{source: images}, background=background, shared=self.shared)[source]
-        return nearest(self.banks[target], torch.nn.functional.normalize(x, dim=1).cpu().numpy(), k)
+        return nearest(self.banks[target], unit(x.cpu().numpy()), k)
 
     def neighbours(self, inputs: Iterable[str], k: int = 3) -> Callable[[dict[str, np.ndarray]], list[str]]:
         """A function from an engine's outputs to "id (label, ...)" of the ``k`` nearest known touches.
@@ -116,8 +112,7 @@ class Embeddings:
         bank, key = self.banks[modality], f"{'shared' if self.shared else 'embedding'}_{modality}"
 
         def find(outputs: dict[str, np.ndarray]) -> list[str]:
-            query = outputs[key] / np.maximum(np.linalg.norm(outputs[key], axis=1, keepdims=True), 1e-12)
-            rows, _ = nearest(bank, query, k)
+            rows, _ = nearest(bank, unit(outputs[key]), k)
             return [f"{self.table.column('id')[r]} ({', '.join(self.labels(r).values())})" for r in rows[0].tolist()]
 
         return find
@@ -126,6 +121,11 @@ class Embeddings:
         """Class names of one row by task, where it has a label."""
         found = {task: self.table.column(f"label_{task}")[row].as_py() for task in self.classes}
         return {task: self.classes[task][label] for task, label in found.items() if label >= 0}
+
+
+def unit(x: np.ndarray) -> np.ndarray:
+    """Unit vectors [N, D]; NaN stays."""
+    return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
 
 
 def nearest(bank: np.ndarray, queries: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:

@@ -50,7 +50,7 @@ class Camera(Source):
 
         target: int | str = int(self.which) if self.which.isdigit() else self.which
         if isinstance(target, str) and not target.startswith("/"):
-            links = sorted(Path("/dev/v4l/by-id").glob(f"*{target}*-index0")) if Path("/dev/v4l/by-id").is_dir() else []
+            links = sorted(Path("/dev/v4l/by-id").glob(f"*{target}*-index0"))
             if not links:
                 raise OSError(f"no camera with serial {target} is plugged in")
             target = str(links[0].resolve())
@@ -58,20 +58,16 @@ class Camera(Source):
         self.capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # an old frame in a queue delays the newest
         if not self.capture.isOpened():
             raise OSError(f"camera {self.which} cannot be opened")
-        asked = (
-            (cv2.CAP_PROP_FRAME_WIDTH, self.size and self.size[0]),
-            (cv2.CAP_PROP_FRAME_HEIGHT, self.size and self.size[1]),
-            (cv2.CAP_PROP_FPS, self.asked),
-        )
-        for name, value in asked:
+        width, height = self.size or (0, 0)
+        asked = {cv2.CAP_PROP_FRAME_WIDTH: width, cv2.CAP_PROP_FRAME_HEIGHT: height, cv2.CAP_PROP_FPS: self.asked}
+        for name, value in asked.items():
             if value:
                 self.capture.set(name, value)
-        given = [self.capture.get(name) for name, _ in asked]
+        given = [self.capture.get(name) for name in asked]
         # A driver may choose another mode without an error; some report no rate.
-        if any(value and has and abs(has - value) > 0.05 * value for has, (_, value) in zip(given, asked, strict=True)):
-            raise OSError(
-                f"camera {self.which} has no such mode: it gives {given[0]:g}x{given[1]:g} at {given[2]:g} fps"
-            )
+        if any(v and has and abs(has - v) > 0.05 * v for has, v in zip(given, asked.values(), strict=True)):
+            mode = f"{given[0]:g}x{given[1]:g} at {given[2]:g} fps"
+            raise OSError(f"camera {self.which} has no such mode: it gives {mode}")
         self.fps = given[2] or 30.0
 
     def read(self) -> np.ndarray:
@@ -215,13 +211,11 @@ def recording(text: str) -> Recording:
     if not 0 < fps < float("inf"):
         raise ValueError(f"source {text!r}: {rate} is no frame rate")
     if not (path.is_dir() or path.suffix.lower() in VIDEOS):
-        raise ValueError(
-            f"source {text!r}: give a video ({', '.join(VIDEOS)}) or a folder[@fps]; live: or a camera or sim"
-        )
+        how = f"give a video ({', '.join(VIDEOS)}) or a folder[@fps]; live: or a camera or sim"
+        raise ValueError(f"source {text!r}: {how}")
     files = Folder(path, fps) if path.is_dir() else Video(path)
     try:  # now: unlike a camera, a missing file does not come back
         files.open()
     except OSError as error:
         raise ValueError(f"source {text!r}: {brief(error)}") from None
-    files.close()
     return files

@@ -4,11 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from PIL import Image
-from tyro.conf import Fixed
 
 from mvitac.data.images import fit
+from mvitac.registry import check_range
 
 SIDE = 32  # side in pixels of the small gray pictures in which contact is detected
+LEAST_CHANGE = 1.0  # mean change in grey levels below which nothing counts as contact, however low the noise
+FOLLOW = 0.01  # share of the change by which the background is updated per frame while nothing is touched
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,16 +21,10 @@ class LiveConfig:
     """Number of first frames, without contact, from which a sensor's background and noise are learned."""
     contact: float = 6.0
     """Contact begins at a change of this many times the noise without contact, and ends at half of that."""
-    least_change: Fixed[float] = 1.0
-    """Mean change in grey levels below which nothing counts as contact, however low the noise."""
-    follow: Fixed[float] = 0.01
-    """Share of the change by which the background is updated per frame while nothing is touched."""
 
     def __post_init__(self) -> None:
-        if self.calibration < 2:
-            raise ValueError(f"calibration {self.calibration}: give at least 2 frames")
-        if not (self.contact > 0 and self.least_change >= 0 and 0 <= self.follow < 1):
-            raise ValueError("contact must be > 0, least_change >= 0 and follow in [0, 1)")
+        check_range(self, 2, 1_000_000, "calibration")
+        check_range(self, 1e-6, 1e6, "contact")
 
 
 class Contact:
@@ -69,19 +65,19 @@ class Contact:
             middle = np.median(frames, axis=0)
             changes = np.abs(frames - middle).mean((1, 2))
             self.noise = float(np.median(changes))
-            self.uneasy = bool(changes.max() > max(self.config.least_change, self.config.contact * self.noise))
+            self.uneasy = bool(changes.max() > max(LEAST_CHANGE, self.config.contact * self.noise))
             if self.uneasy:
                 return None  # something moved: calibrate again
             self.background = middle
             self.picture = np.stack(pictures).mean(0, dtype=np.float32) if pictures else None
         change = float(np.abs(small - self.background).mean())
-        threshold = max(self.config.least_change, self.config.contact * self.noise)
+        threshold = max(LEAST_CHANGE, self.config.contact * self.noise)
         self.level = change / threshold
         self.touched = self.level > (0.5 if self.touched else 1.0)
         if not self.touched:
-            self.background += self.config.follow * (small - self.background)
+            self.background += FOLLOW * (small - self.background)
             if whole is not None and self.picture is not None:
-                self.picture += self.config.follow * (whole - self.picture)
+                self.picture += FOLLOW * (whole - self.picture)
         return self.touched
 
 

@@ -35,10 +35,12 @@ class Recorder:
         sensor: str = "",
         tell: Callable[[str], object] = print,
     ) -> None:
-        """Record into the new folder ``out``; ``channels``: modality -> C of its images, uint8 [S, S, C].
+        """Record into the new folder ``out``.
 
-        ``fps`` is the maximum number of pairs per second. ``sensor`` is the name of the touch sensor, if it is known
-        (column sensor).
+        Args:
+            channels: modality -> C of its images, uint8 [S, S, C].
+            fps: Maximum number of pairs per second.
+            sensor: Name of the touch sensor, if it is known (column sensor).
         """
         if out.exists():
             raise ValueError(f"{out} already exists: choose another --record, or delete it first")
@@ -48,15 +50,9 @@ class Recorder:
         if self.spool.exists():
             how = f'python -c "from mvitac.live.recorder import finish; finish({str(out)!r})"'
             raise ValueError(f"{self.spool} is of a recording that still runs, or crashed and is finished by {how}")
-        spec = DataSpec(
-            name="recording",
-            vision_channels=channels.get("vision", 0),
-            touch_channels=channels.get("touch", 0),
-            tasks=(),
-            group_by="contact",
-            licence="as the one who recorded it decides",
-            source="mvitac live",
-        )
+        channels = {f"{m}_channels": channels.get(m, 0) for m in ("vision", "touch")}
+        about = {"name": "recording", "group_by": "contact", "source": "mvitac live"}
+        spec = DataSpec(**about, **channels, tasks=(), licence="as the one who recorded it decides")  # type: ignore[arg-type]
         self.spool.mkdir(parents=True)
         write_json(self.spool / "recording.json", {"spec": to_json(spec), "sensor": sensor}, sealed=True)
         self.waiting: list[tuple[dict[str, np.ndarray], dict[str, Any]]] = []
@@ -137,16 +133,16 @@ class Recorded(Source):
         return {"recording": [digest_file(path) for path in self.files]}
 
     def read(self, item: int) -> list[Sample]:
-        samples = []
         with np.load(self.files[item], allow_pickle=False) as part:
             arrays = {name: part[name] for name in part.files}
         first = int(self.files[item].stem)
         columns = {n.removeprefix("column_"): x.tolist() for n, x in arrays.items() if n.startswith("column_")}
-        pick: Callable[[str, int], np.ndarray | None] = lambda m, i: arrays[m][i] if m in arrays else None  # noqa: E731
+        samples = []
         for i in range(len(columns["time"])):
             own: dict[str, Any] = {name: values[i] for name, values in columns.items()}
             # Frames of one touch are near-copies, so each touch is a group; so is each rest between touches.
-            group = f"touch-{own['touch_number']:06d}" if own["contact"] else f"rest-{own['touch_number']:06d}"
+            group = f"{'touch' if own['contact'] else 'rest'}-{own['touch_number']:06d}"
             own |= {"id": f"{first + i:08d}", "group": group, "touch_group": group, "split": "unlabelled", **self.named}
-            samples.append(Sample(vision=pick("vision", i), touch=pick("touch", i), columns=own))
+            vision, touch = (arrays[m][i] if m in arrays else None for m in ("vision", "touch"))
+            samples.append(Sample(vision=vision, touch=touch, columns=own))
         return samples

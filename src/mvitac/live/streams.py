@@ -59,17 +59,13 @@ class Stream:
         A frame older than ``stale_after`` seconds is no longer used.
         """
         self.name, self.origin, self.clock, self.tell = name, origin, clock, tell
-        self.stale_after = stale_after
-        self.fault: str | None = None
-        self.ended = False
+        self.stale_after, self.ended, self.fault = stale_after, False, ""
         self.num_frames = self.num_dropped = self.num_damaged = 0
         self._side, self._keep = 0, 0.0
         self._past: deque[tuple[float, np.ndarray]] = deque()
         self._lock = threading.Lock()
         self._newest: Frame | None = None
-        self._taken = True
-        self._open = False
-        self._retry_at = float("-inf")
+        self._taken, self._open, self._retry_at = True, False, float("-inf")
         self._moved_at = self._opened_at = clock()
         self._arrivals: deque[float] = deque(maxlen=30)
 
@@ -143,13 +139,13 @@ class Stream:
     def take(self, image: np.ndarray) -> None:
         """Make ``image`` the newest frame, now."""
         now, before = self.clock(), self._newest
+        changed = before is not None and before.image.shape != image.shape
         if self.fault in ("unplugged", "stalled"):
             self._recovered()
-        if before is None or before.image.shape != image.shape:
-            if before is not None:
-                self._say("resolution changed", f"changed from {_shape(before.image)} to {_shape(image)}")
-            self._moved_at = now
-        elif not np.array_equal(before.image, image):
+        if changed:
+            assert before
+            self._say("resolution changed", f"changed from {_shape(before.image)} to {_shape(image)}")
+        if before is None or changed or not np.array_equal(before.image, image):
             if self.fault == "frozen":
                 self._recovered()
             self._moved_at = now
@@ -161,7 +157,7 @@ class Stream:
             self.num_dropped += not self._taken
             self._newest, self._taken = Frame(image, now, self.num_frames), False
             if self._side:
-                if before is not None and before.image.shape != image.shape:
+                if changed:
                     self._past.clear()  # another lens or crop
                 self._past.append((now, fit(image, self._side)))
                 while len(self._past) > 1 and self._past[1][0] <= now - self._keep:
@@ -176,8 +172,7 @@ class Stream:
             self._say("unplugged", f"is gone ({brief(error)}): trying again every {RETRY_EVERY:g} s")
 
     def _recovered(self) -> None:
-        what = _RECOVERED[self.fault or ""]
-        self.fault = None
+        what, self.fault = _RECOVERED[self.fault], ""
         self._say(what, f"is {what}")
 
     def _say(self, what: str, text: str) -> None:

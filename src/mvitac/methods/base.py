@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
-from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, keep_modes
+from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, keep_modes, trunks
 from mvitac.registry import Registered
 
 Embeddings = dict[Hashable, Tensor]
@@ -104,6 +104,9 @@ class Contrastive(Method):
     caching) or on several processes (all-gathered negatives), and compute the loss over all of it (``training/step.py``).
     """
 
+    towers: nn.ModuleDict
+    """modality -> trunk and head (``build_towers``); a method that has others names its ``encoders`` itself."""
+
     @abstractmethod
     def queries(self, batch: Views) -> Embeddings:
         """Embeddings that receive gradients."""
@@ -118,6 +121,9 @@ class Contrastive(Method):
 
     def forward(self, batch: Views) -> dict[str, Tensor]:
         return self.contrast(self.queries(batch) | self.keys(batch))
+
+    def encoders(self) -> dict[str, nn.Module]:
+        return trunks(self.towers)
 
 
 def present(towers: nn.ModuleDict, batch: Views) -> list[tuple[str, nn.Module]]:
@@ -176,18 +182,6 @@ class MethodConfig(Registered, ABC):
         """Whether ``Views.images["touch"]`` ends with one more view, of the same press through another sensor."""
         return False
 
-    def check_pack(self, pack: Pack) -> None:
-        """Raise ValueError if ``pack`` lacks rows that a setting needs. Called before anything is written."""
-        if not self.sensor_view:
-            return
-        rows, pairs = self.training_rows(pack), np.zeros((2, 0), np.int64)
-        if "press" in pack.table.column_names:
-            pairs = np.unique(np.stack([pack.presses[rows], pack.sensors[rows]]), axis=1)
-        if not (np.bincount(pairs[0]) > 1).any():
-            raise ValueError(
-                "lambda_sensor needs rows of one press (column press) and different sensors (column sensor)"
-            )
-
     def training_rows(self, pack: Pack) -> np.ndarray:
         """Pack rows to train on, ascending: train and unlabelled, with all modalities of their dataset (part of a mix)."""
         rows = pack.rows("train", "unlabelled")
@@ -201,9 +195,8 @@ class MethodConfig(Registered, ABC):
         for modality in modalities:
             lacking = rows[~pack.has(modality)[rows]]
             if len(lacking):
-                parts = ", ".join(np.unique(pack.column("part")[lacking]))
+                no = f"{len(lacking)} rows of part {', '.join(np.unique(pack.column('part')[lacking]))} have no {modality}"
                 others = ", ".join(sorted(name for name, kind in self.choices.items() if kind.takes_missing))  # type: ignore
-                no = f"{len(lacking)} rows of part {parts} have no {modality}"
                 needs = f"method {self.name!r} needs {' and '.join(modalities)} of every row"
                 raise ValueError(f"{needs}, but {no}: choose of {others}")
 

@@ -14,7 +14,7 @@ from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
-from mvitac.nn.encoders import Encoders, Head, Projected, build_trunk, num_features, trunks
+from mvitac.nn.encoders import Encoders, Head, Projected, build_trunk, num_features
 from mvitac.nn.momentum import Momentum, momentum_at
 from mvitac.registry import check_range
 
@@ -54,28 +54,25 @@ class BYOL(Contrastive):
     def __init__(self, config: BYOLConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
-        self.online, self.predictor = nn.ModuleDict(), nn.ModuleDict()
+        self.towers, self.predictor = nn.ModuleDict(), nn.ModuleDict()
         for modality in spec.modalities:
             trunk = build_trunk(encoder[modality], spec.channels(modality), spec.frames(modality))
-            self.online[modality] = Projected(trunk, Head(num_features(trunk), config.hidden, config.out, norm=True))
+            self.towers[modality] = Projected(trunk, Head(num_features(trunk), config.hidden, config.out, norm=True))
             self.predictor[modality] = Head(config.out, config.hidden, config.out, norm=True)
-        self.target = nn.ModuleDict({m: Momentum(tower) for m, tower in self.online.items()})
+        self.target = nn.ModuleDict({m: Momentum(tower) for m, tower in self.towers.items()})
 
     def queries(self, batch: Views) -> Embeddings:
-        z = {(m, i): online(batch.images[m][i]) for m, online in present(self.online, batch) for i in (0, 1)}
+        z = {(m, i): online(batch.images[m][i]) for m, online in present(self.towers, batch) for i in (0, 1)}
         return {("q", m, i): self.predictor[m](found) for (m, i), found in z.items()}
 
     def keys(self, batch: Views) -> Embeddings:
         return {("k", m, i): target(batch.images[m][i]) for m, target in present(self.target, batch) for i in (0, 1)}
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
-        seen = (m for m in self.online if ("q", m, 0) in z)
+        seen = (m for m in self.towers if ("q", m, 0) in z)
         return with_sum(
             {m: regression(z["q", m, 0], z["k", m, 1]) + regression(z["q", m, 1], z["k", m, 0]) for m in seen}
         )
-
-    def encoders(self) -> dict[str, nn.Module]:
-        return trunks(self.online)
 
     def after_step(self, progress: float) -> None:
         for target in self.target.values():

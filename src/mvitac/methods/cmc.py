@@ -27,7 +27,7 @@ from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
-from mvitac.nn.encoders import Encoders, build_towers, heads, trunks
+from mvitac.nn.encoders import Encoders, build_towers, heads
 from mvitac.nn.memory_bank import Bank
 from mvitac.registry import check_range
 
@@ -133,9 +133,6 @@ class CMC(Contrastive):
         for modality, bank in self.banks.items():
             bank.follow(at, z[modality], self.config.bank_momentum)  # type: ignore[operator]
         self.z_norm.copy_(norm)
-
-    def encoders(self) -> dict[str, nn.Module]:
-        return trunks(self.towers)
 
     def projectors(self) -> dict[str, nn.Module]:
         return heads(self.towers)

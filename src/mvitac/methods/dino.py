@@ -24,7 +24,7 @@ from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
-from mvitac.nn.encoders import Encoders, build_towers, trunks
+from mvitac.nn.encoders import Encoders, build_towers
 from mvitac.nn.momentum import Momentum, momentum_at
 from mvitac.registry import check_range
 
@@ -92,13 +92,13 @@ class DINO(Contrastive):
     def __init__(self, config: DINOConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
-        self.student = build_towers(encoder, spec, lambda width: Prototypes(width, config.hidden, config.out))
-        self.teacher = nn.ModuleDict({m: Momentum(tower) for m, tower in self.student.items()})
-        self.register_buffer("centre", torch.zeros(len(self.student), config.out))
+        self.towers = build_towers(encoder, spec, lambda width: Prototypes(width, config.hidden, config.out))
+        self.teacher = nn.ModuleDict({m: Momentum(tower) for m, tower in self.towers.items()})
+        self.register_buffer("centre", torch.zeros(len(self.towers), config.out))
         self.pending: Tensor | None = None
 
     def queries(self, batch: Views) -> Embeddings:
-        return {("student", m, i): t(batch.images[m][i]) for m, t in present(self.student, batch) for i in (0, 1)}
+        return {("student", m, i): t(batch.images[m][i]) for m, t in present(self.towers, batch) for i in (0, 1)}
 
     def keys(self, batch: Views) -> Embeddings:
         return {("teacher", m, i): t(batch.images[m][i]) for m, t in present(self.teacher, batch) for i in (0, 1)}
@@ -106,7 +106,7 @@ class DINO(Contrastive):
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         config, losses, means = self.config, {}, []
         with torch.autocast(self.centre.device.type, enabled=False):
-            for m, centre in zip(self.student, self.centre, strict=True):
+            for m, centre in zip(self.towers, self.centre, strict=True):
                 if ("student", m, 0) not in z:
                     means.append(centre)  # after_step leaves it where it is
                     continue
@@ -117,9 +117,6 @@ class DINO(Contrastive):
                 means.append(torch.cat(raw).mean(0))
         self.pending = torch.stack(means)
         return with_sum(losses)
-
-    def encoders(self) -> dict[str, nn.Module]:
-        return trunks(self.student)
 
     def after_step(self, progress: float) -> None:
         assert self.pending is not None, "call forward first"

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
-from mvitac.methods.base import Contrastive, Embeddings, Views
+from mvitac.methods.base import Embeddings
 from mvitac.methods.moco import QueueConfig
 from mvitac.methods.mvitac import PARTS, MViTac, MViTacConfig
 from mvitac.nn.encoders import Encoders
@@ -63,53 +63,37 @@ def hinge(
         return F.relu(margin - (query * key).sum(1, keepdim=True) + query @ queue.T).mean()
 
 
-class MCT(Contrastive):
+class MCT(MViTac):
     """MViTac's query and key towers, and a queue for each head of each modality."""
 
-    views = 2
-
     def __init__(self, config: MCTConfig, spec: DataSpec, encoder: Encoders) -> None:
-        super().__init__()
-        self.config = config
         same = ("temperature", "lambda_inter", "momentum", "out", "hidden", "head_norm")
-        self.towers = MViTac(MViTacConfig(**{name: getattr(config, name) for name in same}), spec, encoder)
-        self.queues = nn.ModuleDict()
+        super().__init__(MViTacConfig(**{name: getattr(config, name) for name in same}), spec, encoder)
+        self.mct, self.queues = config, nn.ModuleDict()
         self.pending: dict[tuple[str, str], Tensor] = {}
 
     def prepare(self, rows: Tensor) -> None:
-        size = self.config.queue_size(len(rows))
-        self.queues = nn.ModuleDict({f"{m}_{head}": Queue(size, self.config.out) for m, head in HEADS})
-
-    def queries(self, batch: Views) -> Embeddings:
-        return self.towers.queries(batch)
-
-    def keys(self, batch: Views) -> Embeddings:
-        return self.towers.keys(batch)
+        size = self.mct.queue_size(len(rows))
+        self.queues = nn.ModuleDict({f"{m}_{head}": Queue(size, self.mct.out) for m, head in HEADS})
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         assert self.queues, "call prepare(rows) first"
-        config, losses = self.config, {}
+        losses = {}
         self.pending = {(m, head): z["k", m, 1, head] for m, head in HEADS}
         for part, (x, y) in PARTS.items():
             head = "intra" if x == y else "inter"
             query, key, queue = z["q", x, 0, head], z["k", y, 1, head], self.queue(y, head).keys
             if x == y:
-                losses[part] = queue_nce(query, key, queue, config.temperature)
+                losses[part] = queue_nce(query, key, queue, self.mct.temperature)
             else:
-                losses[part] = hinge(query, key, queue, config.margin)
-        loss = losses["vv"] + losses["tt"] + config.lambda_inter * (losses["vt"] + losses["tv"])
+                losses[part] = hinge(query, key, queue, self.mct.margin)
+        loss = losses["vv"] + losses["tt"] + self.mct.lambda_inter * (losses["vt"] + losses["tv"])
         return {"loss": loss, **losses}
 
     def queue(self, modality: str, head: str) -> Queue:
         return self.queues[f"{modality}_{head}"]  # type: ignore[return-value]
 
-    def encoders(self) -> dict[str, nn.Module]:
-        return self.towers.encoders()
-
-    def projectors(self) -> dict[str, nn.Module]:
-        return self.towers.projectors()
-
     def after_step(self, progress: float) -> None:
         for (modality, head), keys in self.pending.items():
             self.queue(modality, head).push(keys)
-        self.towers.after_step(progress)
+        super().after_step(progress)

@@ -15,7 +15,7 @@ from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
-from mvitac.nn.encoders import Encoders, Head, build_towers, trunks
+from mvitac.nn.encoders import Encoders, Head, build_towers
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Queue
 from mvitac.nn.momentum import Momentum
@@ -78,30 +78,27 @@ class MoCo(Contrastive):
         super().__init__()
         self.config = config
         sizes = config.hidden, config.out
-        self.query = build_towers(encoder, spec, lambda width: Head(width, *sizes, norm=config.head_norm))
-        self.key = nn.ModuleDict({m: Momentum(tower) for m, tower in self.query.items()})
+        self.towers = build_towers(encoder, spec, lambda width: Head(width, *sizes, norm=config.head_norm))
+        self.key = nn.ModuleDict({m: Momentum(tower) for m, tower in self.towers.items()})
         self.queues = nn.ModuleDict()
         self.pending: dict[str, Tensor] = {}
 
     def prepare(self, rows: Tensor) -> None:
         size = self.config.queue_size(len(rows))
-        self.queues = nn.ModuleDict({m: Queue(size, self.config.out) for m in self.query})
+        self.queues = nn.ModuleDict({m: Queue(size, self.config.out) for m in self.towers})
 
     def queries(self, batch: Views) -> Embeddings:
-        return {("q", m): tower(batch.images[m][0]) for m, tower in present(self.query, batch)}
+        return {("q", m): tower(batch.images[m][0]) for m, tower in present(self.towers, batch)}
 
     def keys(self, batch: Views) -> Embeddings:
         return {("k", m): tower(batch.images[m][1]) for m, tower in present(self.key, batch)}
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         assert self.queues, "call prepare(rows) first"
-        self.pending = {m: z["k", m] for m in self.query if ("k", m) in z}
+        self.pending = {m: z["k", m] for m in self.towers if ("k", m) in z}
         tau = self.config.temperature
         queue: dict[str, Tensor] = {m: queue.keys for m, queue in self.queues.items()}  # type: ignore[misc]
         return with_sum({m: queue_nce(z["q", m], z["k", m], queue[m], tau) for m in self.pending})
-
-    def encoders(self) -> dict[str, nn.Module]:
-        return trunks(self.query)
 
     def after_step(self, progress: float) -> None:
         for modality, keys in self.pending.items():

@@ -103,6 +103,14 @@ class MViTacConfig(MethodConfig):
 
     def training_rows(self, pack: Pack) -> np.ndarray:
         rows = super().training_rows(pack)
+        if self.sensor_view:
+            pairs = np.zeros((2, 0), np.int64)
+            if "press" in pack.table.column_names:
+                pairs = np.unique(np.stack([pack.presses[rows], pack.sensors[rows]]), axis=1)
+            if not (np.bincount(pairs[0]) > 1).any():
+                raise ValueError(
+                    "lambda_sensor needs rows of one press (column press) and different sensors (column sensor)"
+                )
         has = {modality: pack.has(modality)[rows] for modality in pack.spec.modalities}
         parts = [PARTS[part] for part in self.losses if set(PARTS[part]) <= has.keys()]
         return rows[np.any([has[x] & has[y] for x, y in parts], axis=0)] if parts else rows

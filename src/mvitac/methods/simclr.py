@@ -10,12 +10,12 @@ from typing import ClassVar
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
-from mvitac.nn.encoders import Encoders, Head, build_towers, trunks
+from mvitac.nn.encoders import Encoders, Head, build_towers
 from mvitac.registry import check_range
 
 
@@ -69,6 +69,3 @@ class SimCLR(Contrastive):
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         return with_sum({m: nt_xent(z[m, 0], z[m, 1], self.config.temperature) for m in self.towers if (m, 0) in z})
-
-    def encoders(self) -> dict[str, nn.Module]:
-        return trunks(self.towers)

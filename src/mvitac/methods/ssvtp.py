@@ -17,7 +17,7 @@ from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
-from mvitac.nn.encoders import Encoders, build_towers, heads, trunks
+from mvitac.nn.encoders import Encoders, build_towers, heads
 from mvitac.nn.losses import info_nce
 from mvitac.registry import check_range
 
@@ -58,9 +58,6 @@ class SSVTP(Contrastive):
         vt = info_nce(z["vision"], z["touch"], self.config.temperature)
         tv = info_nce(z["touch"], z["vision"], self.config.temperature)
         return {"loss": (vt + tv) / 2, "vt": vt, "tv": tv}
-
-    def encoders(self) -> dict[str, nn.Module]:
-        return trunks(self.towers)
 
     def projectors(self) -> dict[str, nn.Module]:
         return heads(self.towers)

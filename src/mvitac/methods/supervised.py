@@ -69,13 +69,11 @@ class LabelledConfig(MethodConfig):
 
     def heads(self, spec: DataSpec, layers: Callable[[int], nn.Module]) -> dict[str, nn.Module]:
         """A head for each task to learn. ``layers`` creates one with this number of outputs."""
-
-        def head(task: AnyTask) -> nn.Module:
-            if isinstance(task, Task):
-                return layers(len(task.classes))
-            return ValueHead(layers(len(task.targets)), len(task.targets))
-
-        return {task.name: head(task) for task in self.tasks_of(spec)}
+        found = {}
+        for task in self.tasks_of(spec):
+            num = len(task.classes if isinstance(task, Task) else task.targets)
+            found[task.name] = layers(num) if isinstance(task, Task) else ValueHead(layers(num), num)
+        return found
 
 
 class ValueHead(nn.Module):
@@ -91,7 +89,6 @@ class ValueHead(nn.Module):
         self.register_buffer("std", torch.ones(num))
 
     def learn_scale(self, values: Tensor) -> None:
-        """Take ``mean`` and ``std`` of ``values`` [N, T]; NaN = not measured."""
         known = values.double().numpy()
         self.mean.copy_(torch.from_numpy(np.nanmean(known, axis=0)))
         self.std.copy_(torch.from_numpy(np.nanstd(known, axis=0)).clamp(min=1e-12))
@@ -136,9 +133,8 @@ class SupervisedConfig(LabelledConfig):
 
     def _drawn_groups(self, pack: Pack, rows: np.ndarray) -> tuple[list[str], list[str]]:
         """Names of the groups to learn from, and of those to choose settings on. A larger share adds to a smaller."""
-        groups = pack.column("group")[rows].astype(str)
+        groups, tasks = pack.column("group")[rows].astype(str), self.tasks_of(pack.spec)
         order = np.random.default_rng(self.draw).permutation(np.unique(groups))
-        tasks = self.tasks_of(pack.spec)
         needed: dict[str, None] = {}
         for task in tasks:
             labels = pack.labels(task.name, *self.label_splits)[rows] if isinstance(task, Task) else np.zeros(len(rows))
@@ -148,8 +144,7 @@ class SupervisedConfig(LabelledConfig):
         drawn = [*needed, *(name for name in order if name not in needed)]
         drawn = drawn[: max(len(needed), round(self.share * len(drawn)))]
         spare = [name for name in drawn if name not in needed]
-        val = set(groups[pack.column(tasks[0].split)[rows] == "val"])
-        held = [name for name in spare if name in val]
+        held = [name for name in spare if name in set(groups[pack.column(tasks[0].split)[rows] == "val"])]
         held = held if len(held) > 1 else spare[max(0, len(spare) - len(drawn) // 5) :]
         if self.hold_out and not held:
             raise ValueError(f"{len(drawn)} labelled {pack.spec.group_by}s are too few to hold some out")

@@ -21,7 +21,7 @@ from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
-from mvitac.nn.encoders import Encoders, build_towers, trunks
+from mvitac.nn.encoders import Encoders, build_towers
 from mvitac.registry import check_range
 
 
@@ -93,6 +93,3 @@ class VICReg(Contrastive):
             weights = self.config
             losses[modality] = weights.invariance * s + weights.variance * v + weights.covariance * c
         return with_sum(losses)
-
-    def encoders(self) -> dict[str, nn.Module]:
-        return trunks(self.towers)

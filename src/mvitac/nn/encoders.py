@@ -96,8 +96,8 @@ class EncoderConfig:
 
     def __post_init__(self) -> None:
         for name in ("lr_scale", "layer_decay"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name} {getattr(self, name)}: give a factor above 0, at most 1")
+            if not 0 < (factor := getattr(self, name)) <= 1:
+                raise ValueError(f"{name} {factor}: give a factor above 0, at most 1")
         if not timm.is_model(self.trunk.split(".")[0]):
             near = difflib.get_close_matches(self.trunk.split(".")[0], timm.list_models(), n=3)
             hint = f"; did you mean {', '.join(near)}?" if near else ""
@@ -148,7 +148,12 @@ def build_trunk(config: EncoderConfig, channels: int, frames: int = 1) -> nn.Mod
     available: there is no silent fallback to random weights.
     """
     single = frames == 1 or config.temporal == "stack"
-    trunk = use_products(_with_stem(config, channels if single else channels // frames))
+    channels = channels if single else channels // frames
+    trunk = _from_timm(config, channels)
+    if config.stem == "random" and channels != 3:
+        for name in stem_names(trunk):
+            trunk.get_submodule(name).reset_parameters()  # type: ignore[operator]
+    trunk = use_products(trunk)
     trunk = trunk if single else PerFrame(trunk, frames)
     trunk.locked, trunk.keep_norms = config.locked, config.keep_norms  # type: ignore[assignment]
     return trunk.requires_grad_(False) if config.locked else trunk
@@ -181,14 +186,6 @@ class PerFrame(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         each = images.unflatten(1, (self.frames, -1)).flatten(0, 1)
         return self.trunk(each).unflatten(0, (-1, self.frames)).mean(1)
-
-
-def _with_stem(config: EncoderConfig, channels: int) -> nn.Module:
-    trunk = _from_timm(config, channels)
-    if config.stem == "random" and channels != 3:
-        for name in stem_names(trunk):
-            trunk.get_submodule(name).reset_parameters()  # type: ignore[operator]
-    return trunk
 
 
 def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:
@@ -225,17 +222,8 @@ def timm_trunk(
     known: dict[str, Any] = getattr(encoder, "pretrained_cfg", None) or {}
     kept = {key: known[key] for key in ("first_conv", "classifier", "fixed_input_size") if key in known}
     # timm resizes as `Model.transform` does when images are stored at the size that the encoder sees.
-    resize: dict[str, Any] = {"interpolation": "bilinear", "crop_pct": 1.0, "crop_mode": "squash"}
-    cfg = PretrainedCfg(
-        architecture=name.split(".")[0],
-        tag="mvitac",
-        input_size=input_size,
-        mean=mean,
-        std=std,
-        num_classes=0,
-        **resize,
-        **kept,
-    ).to_dict()
+    kept |= {"interpolation": "bilinear", "crop_pct": 1.0, "crop_mode": "squash", "num_classes": 0, "tag": "mvitac"}
+    cfg = PretrainedCfg(architecture=name.split(".")[0], input_size=input_size, mean=mean, std=std, **kept).to_dict()
     trunk.pretrained_cfg = trunk.default_cfg = cfg  # type: ignore[assignment]
     return trunk
 

@@ -29,10 +29,6 @@ class Init:
     digest: Fixed[str] = ""
     """sha256 of the weights. Training records it."""
 
-    def __post_init__(self) -> None:
-        if not (self.path or self.digest) and (self.modalities or not self.heads):
-            raise ValueError("init modalities and heads say what to take of other weights: name them, --init RUN")
-
     def __bool__(self) -> bool:
         return self.path is not None
 
@@ -40,16 +36,14 @@ class Init:
     def file(self) -> Path:
         """The file with the weights; ValueError if there is none."""
         assert self.path is not None
-        path = Path(named(str(self.path)))
-        if path.is_file():
-            return path
-        if not path.is_dir():
-            raise ValueError(f"init {path} does not exist: give the folder of a run or artifact, or .safetensors")
-        if not (path / MODEL).is_file():
-            unfinished = (path / "checkpoint.pt").exists()
-            why = "its run is not finished, continue it with --resume" if unfinished else "give that of a finished run"
-            raise ValueError(f"init {path} is a folder without {MODEL}: {why}")
-        return path / MODEL
+        place = Path(named(str(self.path)))
+        file = place / MODEL if place.is_dir() else place
+        if not file.is_file():
+            unfinished = "; its run is not finished, continue it with --resume" * (place / "checkpoint.pt").exists()
+            raise ValueError(
+                f"init {file} does not exist{unfinished}: give a finished run, an artifact or .safetensors"
+            )
+        return file
 
     def resolved(self) -> "Init":
         """The same with ``digest``; ValueError if there are no such weights, or they are others than those of it."""

@@ -28,10 +28,6 @@ class Momentum(nn.Module):
     def forward(self, *inputs: Any) -> Any:
         return self.module(*inputs)
 
-    def restart(self) -> None:
-        """Copy the query module again, after other weights were loaded into it."""
-        self.follow(0.0)
-
     @torch.no_grad()
     def follow(self, m: float) -> None:
         """Move all parameters and floating-point buffers towards the query's. Copy integer buffers (counters)."""

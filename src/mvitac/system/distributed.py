@@ -36,10 +36,6 @@ class World:
         dist.all_gather(everyones, own.contiguous())
         return torch.cat(everyones)
 
-    def own(self, everyones: Tensor, num: int) -> Tensor:
-        """Return this process's ``num`` rows of a gathered tensor."""
-        return everyones[self.rank * num : (self.rank + 1) * num]
-
     def sum_gradients(self, module: nn.Module) -> None:
         """Sum the gradients over processes, in one message."""
         if self.size == 1:
@@ -84,10 +80,3 @@ def local_device(name: str) -> str:
     if name in ("auto", "cuda") and "LOCAL_RANK" in os.environ and torch.cuda.is_available():
         return f"cuda:{os.environ['LOCAL_RANK']}"
     return name
-
-
-def synchronise_norms(module: nn.Module, world: World) -> nn.Module:
-    """Make every BatchNorm compute statistics over all processes, on GPUs. torch has none for CPUs."""
-    if world.size > 1 and next(module.parameters()).is_cuda:
-        return nn.SyncBatchNorm.convert_sync_batchnorm(module)
-    return module

@@ -15,37 +15,25 @@ from typing import Any, BinaryIO
 
 
 def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, sync: bool = True) -> None:
-    """Write a temporary file next to ``path``, then rename it to ``path``, so that no reader sees a partial file.
+    """Let ``write`` fill a temporary file next to ``path``, then rename it, so that no reader sees a partial file.
 
-    If it fails (full disk, Ctrl-C), the temporary file is removed and ``path`` is unchanged. Those of processes that were
-    killed are removed by a later write to ``path`` (with ``sync``).
-
-    Args:
-        path: The file to write. Missing folders are created.
-        write: Called with the open file.
-        sync: Flush to disk, which protects against power loss. Without it, only a killed process is safe.
+    Missing folders are created. After an error (full disk, Ctrl-C) ``path`` is unchanged. ``sync`` flushes to disk, which
+    protects against power loss, and removes temporary files that killed processes left.
     """
-    made = [parent for parent in path.parents if not parent.exists()]
-    neighbour = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if sync:
+        _remove_orphans(path)
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
-        if sync and not made:
-            _remove_orphans(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with neighbour.open("wb") as file:
+        with naming(path), temporary.open("wb") as file:
             write(file)
             file.flush()
             if sync:
                 os.fsync(file.fileno())
-        os.replace(neighbour, path)
-    except BaseException as error:
+        os.replace(temporary, path)
+    except BaseException:
         with contextlib.suppress(OSError):
-            neighbour.unlink(missing_ok=True)
-            for parent in made:  # deepest first; rmdir removes empty folders only
-                parent.rmdir()
-        if isinstance(error, OSError) and error.filename in (None, str(neighbour)):
-            if error.errno is None:  # numpy raises "1000 requested and 0 written" on a full disk
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
-            error.filename = str(path)  # a failed write has no file name
+            temporary.unlink()
         raise
 
 
@@ -69,27 +57,25 @@ def _remove_orphans(path: Path) -> None:
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Add ``path`` to errors of writing it, because an error of a full disk has no file name."""
+    """Name ``path`` in errors of writing it: that of a full disk has no file name, and numpy's not even a number."""
     try:
         yield
     except OSError as error:
+        if error.errno is None:  # "1000 requested and 0 written"
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
         error.filename = error.filename or str(path)
         raise
 
 
 def check_place(path: Path) -> None:
     """Raise ValueError if ``path`` cannot be written. Call it before the work whose result is written there."""
-    if "\0" in str(path):
-        raise ValueError(f"{path}: a name cannot hold a NUL character, choose another")
     parent = next(p for p in path.absolute().parents if os.path.lexists(p))
     try:
         path.exists()  # raises OSError if the name is too long
-        if not parent.is_dir():
-            raise ValueError(f"{path} cannot be written: {parent} is not a folder, choose another place")
         with tempfile.TemporaryFile(dir=parent):
             pass
     except OSError as error:
-        raise ValueError(f"{path} cannot be written: {error.strerror}, choose another place") from None
+        raise ValueError(f"{path} cannot be written: {error.strerror} ({parent})") from None
 
 
 def brief(error: BaseException) -> str:
@@ -112,22 +98,16 @@ def write_json(path: Path, value: Any, *, sealed: bool = False) -> None:
 
 
 def read_json(path: Path, what: str) -> Any:
-    """Read a JSON file; ValueError says if it is missing, damaged or changed. ``what`` describes it in the message.
-
-    Files without a seal, as all of version 0.1.0, are read as they are.
-    """
+    """Read a JSON file; ValueError says if it is missing, damaged, or changed since it was sealed. ``what`` describes it."""
     try:
         value = parse_json(path.read_text())
     except FileNotFoundError:
         raise ValueError(f"{path} does not exist: {what} is missing there") from None
-    except (IsADirectoryError, NotADirectoryError):
-        raise ValueError(f"{path} is a folder, or is below a file: give the file of {what}") from None
-    except ValueError as error:  # also: invalid UTF-8, numbers of 5000 digits
+    except (OSError, ValueError) as error:  # also: a folder, invalid UTF-8, numbers of 5000 digits
         raise ValueError(f"{path} is not valid JSON ({brief(error)}): {what} is damaged") from None
     if isinstance(value, dict) and SEAL in value and value.pop(SEAL) != digest(value):
-        raise ValueError(
-            f"{path} does not match its digest: {what} was damaged or edited (or delete the entry {SEAL!r})"
-        )
+        how = f"{what} was damaged or edited (or delete the entry {SEAL!r})"
+        raise ValueError(f"{path} does not match its digest: {how}")
     return value
 
 

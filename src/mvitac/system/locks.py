@@ -23,9 +23,8 @@ def hold_lock(place: Path, busy: str, *, wait: bool, quiet: bool = False) -> Ite
     Locks work between machines if their shared file system supports them; otherwise nothing is locked. If another
     process holds it, ``wait`` for it after printing ``busy`` (unless ``quiet``), or raise ``Busy`` with that message.
     """
-    place = place.absolute()
     # No soft lock: it would remain after a process is killed.
-    lock = FileLock(place.with_name(place.name + ".lock"), fallback_to_soft=False, is_singleton=True)
+    lock = FileLock(f"{place.absolute()}.lock", fallback_to_soft=False, is_singleton=True)
     try:
         lock.acquire(blocking=False)
     except Timeout:
@@ -52,8 +51,7 @@ def new_folder(out: Path) -> Iterator[Path]:
     Raises Busy if another process writes ``out``, ValueError if it exists or cannot be written.
     """
     check_place(out)
-    busy = f"{out} is being written by another process: wait until it ends, or choose another place"
-    with hold_lock(out, busy, wait=False):
+    with hold_lock(out, f"{out} is being written by another process: wait, or choose another place", wait=False):
         if out.exists():
             raise ValueError(f"{out} already exists: choose another place, or delete it first")
         partial = out.with_name(out.name + ".partial")

@@ -8,6 +8,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 from tqdm import tqdm
@@ -46,25 +47,24 @@ def work(what: str, total: int | None = None, unit: str = "", *, done: int = 0) 
     if sys.stderr.isatty():  # a pipe or a file gets a line now and then
         look = {"mininterval": 0.1, "delay": 0.5, "dynamic_ncols": True, "leave": None}
     with _Bar(desc=what, total=total, unit=f" {unit}", initial=done, miniters=1, **look) as bar:
-
-        def advance(num: int = 1, text: str = "") -> None:
-            with _Bar.get_lock():
-                if text:
-                    bar.set_postfix_str(text, refresh=False)
-                bar.update(num)
-
         _bars.append(bar)
         try:
-            yield advance
+            yield partial(_advance, bar)
         finally:
             _bars.remove(bar)
+
+
+def _advance(bar: _Bar, num: int = 1, text: str = "") -> None:
+    with _Bar.get_lock():
+        if text:
+            bar.set_postfix_str(text, refresh=False)
+        bar.update(num)
 
 
 def tick(unit: str) -> None:
     """Count one more ``unit`` for the innermost ``work`` with that unit, if there is one."""
     for bar in [bar for bar in _bars if bar.unit == f" {unit}"][-1:]:
-        with _Bar.get_lock():
-            bar.update(1)
+        _advance(bar)
 
 
 def say(text: str) -> None:

@@ -5,7 +5,7 @@ import importlib.metadata
 import os
 import platform
 import subprocess
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -35,15 +35,12 @@ def git_commit() -> str | None:
 
     As of the first call in a process, which runs the code that was there then.
     """
+    top = Path(__file__).parents[3]
+    if not (top / ".git").exists():
+        return None
+    git = partial(subprocess.run, capture_output=True, text=True, check=True, timeout=10, cwd=top)
     try:
-        top = Path(_git("rev-parse", "--show-toplevel"))
-        if Path(__file__).parent != top / "src" / "mvitac" / "system":
-            return None  # installed inside another repository
-        return _git("rev-parse", "HEAD") + ("+" if _git("status", "--porcelain", "--", "src") else "")
+        changed = git(["git", "status", "--porcelain", "--", "src"]).stdout.strip()
+        return git(["git", "rev-parse", "HEAD"]).stdout.strip() + "+" * bool(changed)
     except (OSError, subprocess.SubprocessError):
         return None
-
-
-def _git(*arguments: str) -> str:
-    command = ["git", "-C", str(Path(__file__).parent), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()

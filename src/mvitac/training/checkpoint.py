@@ -24,10 +24,6 @@ from mvitac.system.files import brief, write_atomic
 CHECKPOINT, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
 
 
-class Damaged(ValueError):
-    """The file is not what was written."""
-
-
 def save(
     out: Path, run: Run, method: Method, optimiser: torch.optim.Optimizer, step: int, kept: dict[str, Any] | None = None
 ) -> None:
@@ -56,13 +52,15 @@ def restore(
     If it is damaged, it is deleted and the one before it is used, with a message on stderr. Returns the number of steps
     that are done, 0 without a checkpoint, and what it kept; ValueError if both are damaged, or belong to another run.
     """
-    found = [path for path in (out / CHECKPOINT, out / PREVIOUS) if path.exists()]
-    damage: Damaged | None = None
+    found, damage = [path for path in (out / CHECKPOINT, out / PREVIOUS) if path.exists()], ""
     for path in found:
         try:
-            state = _read(path)
-        except Damaged as error:
-            damage = damage or error
+            with zipfile.ZipFile(path) as archive:
+                if (name := archive.testzip()) is not None:
+                    raise ValueError(f"{name} does not match its checksum")
+            state = torch.load(path, map_location="cpu", weights_only=True)
+        except Exception as error:  # zipfile and torch raise several types for damaged files
+            damage = damage or f"{path} is damaged ({brief(error)})"
             continue
         if state.get("run") != run.digest():
             raise ValueError(f"{path} belongs to another run: restore the one of this run, or delete it to start over")
@@ -73,18 +71,5 @@ def restore(
             (out / CHECKPOINT).unlink()  # else the next checkpoint would push it to the place of the good one
         return state["step"], state["kept"]
     if damage:
-        both = f" and {PREVIOUS}" if len(found) > 1 else ""
-        raise ValueError(f"{damage}: delete it{both} to start over")
+        raise ValueError(f"{damage}: delete it{f' and {PREVIOUS}' if len(found) > 1 else ''} to start over")
     return 0, {}
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            if (name := archive.testzip()) is not None:
-                raise Damaged(f"{path} is damaged ({name} does not match its checksum)")
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except Damaged:
-        raise
-    except Exception as error:  # zipfile and torch raise several types for damaged files
-        raise Damaged(f"{path} is damaged ({brief(error)})") from None

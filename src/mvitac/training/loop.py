@@ -21,8 +21,8 @@ from mvitac.system.distributed import join
 from mvitac.system.locks import hold_lock
 from mvitac.training import checkpoint
 from mvitac.training.log import EARLY, Log, Logger
-from mvitac.training.sampler import mix
-from mvitac.training.setup import Setup, check_out, check_still_there, set_up
+from mvitac.training.sampler import Batches, mix
+from mvitac.training.setup import Setup, check_out, set_up
 from mvitac.training.validation import Validation
 
 MIN_BETWEEN_CHECKPOINTS = 10
@@ -78,7 +78,7 @@ def train(
     out = Path(out)
     check_out(out, resume)
     world = join()
-    busy = f"{out} is being trained by another process: wait until it ends, or choose another --out"
+    busy = f"{out} is being trained by another process: wait, or choose another --out"
     with hold_lock(out, busy, wait=False) if world.writes else nullcontext():
         setup = set_up(run, out, world, quiet=quiet, pack=pack)
         if setup is not None:  # else the run is already finished
@@ -88,10 +88,13 @@ def train(
 
 def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], validate: bool) -> None:
     run, pack, world, method, step = setup.run, setup.pack, setup.world, setup.method, setup.step
-    start, num_steps = setup.start, setup.num_steps
-    steps_per_epoch = run.steps_per_epoch(len(setup.rows))
+    start, num_steps, steps_per_epoch = (
+        setup.start,
+        run.num_steps(len(setup.rows)),
+        run.steps_per_epoch(len(setup.rows)),
+    )
     save_every = run.checkpoint_every or max(MIN_BETWEEN_CHECKPOINTS, num_steps // 10)
-    batches = setup.chunks(start, num_steps)
+    batches = setup.views.each(Batches(run, pack, setup.rows), start, num_steps)
 
     # Only rank 0 logs and evaluates; on the other processes ``log`` is None.
     measured = {task.name for task in pack.spec.values}
@@ -136,15 +139,20 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
 
             # Save a checkpoint.
             if save and world.writes:
-                check_still_there(out)
+                _check_still_there(out)
                 checkpoint.save(out, run, method, step.optimiser, done, kept=setup.kept)
             if stop and not last:
                 raise Interrupted(f"stopped after step {done} of {num_steps}; {out} continues with resume")
     if world.writes:
         Model(method, run, setup.spec, pack.size).save(out / "model.safetensors")
-        check_still_there(out)
+        _check_still_there(out)
         (out / checkpoint.PREVIOUS).unlink(missing_ok=True)
     world.wait()
+
+
+def _check_still_there(out: Path) -> None:
+    if not (out / "run.json").exists():
+        raise ValueError(f"{out / 'run.json'} is gone: {out} was deleted or moved during training, start again")
 
 
 def _check_finite(losses: dict[str, float], step: int, run: Run) -> None:
@@ -160,10 +168,8 @@ def _check_weights(method: Method, step: int, run: Run) -> None:
 
 
 def _diverged(what: str, run: Run) -> Diverged:
-    return Diverged(
-        f"{what}: lower --optim.lr (now {run.optim.lr:g}), add --optim.warmup 0.05, or use --precision fp32; the last"
-        " checkpoint is kept"
-    )
+    how = f"lower --optim.lr (now {run.optim.lr:g}), add --optim.warmup 0.05, or use --precision fp32"
+    return Diverged(f"{what}: {how}; the last checkpoint is kept")
 
 
 @contextmanager

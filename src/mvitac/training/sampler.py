@@ -25,24 +25,19 @@ class Batches:
     """Pack rows of each step. The order of an epoch depends on (seed, epoch)."""
 
     def __init__(self, run: Run, pack: Pack, rows: np.ndarray) -> None:
-        self.rows, self.seed = rows, run.seed
-        self.per_epoch, self.batch_size = run.steps_per_epoch(len(rows)), run.batch_size
+        self.rows, self.seed, self.shape = rows, run.seed, (run.steps_per_epoch(len(rows)), run.batch_size)
         self.touch_groups = pack.touch_groups[rows] if run.sampler != "shuffle" else None
-        self.order = spread_order if run.sampler == "spread" else epoch_order
-        self._epoch = lru_cache(2)(self._order)
+        self.order: Order = spread_order if run.sampler == "spread" else epoch_order
         weighted = isinstance(pack, MixedPack) and pack.weighted
-        self.drawn = PartOrder(run, pack, rows, self.per_epoch, self.order) if weighted else None  # type: ignore[arg-type]
+        self._epoch = lru_cache(2)(PartOrder(self, pack).epoch if weighted else self._pass)  # type: ignore[arg-type]
 
     def __getitem__(self, step: int) -> np.ndarray:
         """Rows [batch_size] of step ``step``, counted from 0."""
-        return self._epoch(step // self.per_epoch)[step % self.per_epoch]
+        return self._epoch(step // self.shape[0])[step % self.shape[0]]
 
-    def _order(self, epoch: int) -> np.ndarray:
-        """[per_epoch, batch_size]"""
-        seed, num = mix(self.seed, 1, epoch), self.per_epoch * self.batch_size
-        if self.drawn:
-            return self.drawn.epoch(epoch)
-        return self.rows[self.order(len(self.rows), self.touch_groups, seed)[:num]].reshape(self.per_epoch, -1)
+    def _pass(self, epoch: int) -> np.ndarray:
+        order = self.order(len(self.rows), self.touch_groups, mix(self.seed, 1, epoch))
+        return self.rows[order[: self.shape[0] * self.shape[1]]].reshape(self.shape)
 
 
 class PartOrder:
@@ -50,18 +45,18 @@ class PartOrder:
 
     An epoch draws as many rows as it has room for. Each draw is of a random part, by weight: a row, or a whole batch if
     batches are of one part. It takes the next rows of that part's endless sequence: pass after pass over its rows, each
-    pass in another ``order``. All of it is a function of (seed, epoch); the number of earlier draws is counted from the
-    first epoch.
+    pass in another order. All of it is a function of (seed, epoch); earlier draws are counted from the first epoch on.
     """
 
-    def __init__(self, run: Run, pack: MixedPack, rows: np.ndarray, per_epoch: int, order: Order) -> None:
-        self.seed, self.order, self.shape = run.seed, order, (per_epoch, run.batch_size)
+    def __init__(self, batches: Batches, pack: MixedPack) -> None:
+        self.seed, self.order, self.shape, rows = batches.seed, batches.order, batches.shape, batches.rows
         self.part_of = pack.part_of
         self.rows = [rows[pack.part_of[rows] == number] for number in range(len(pack.parts))]
-        self.touch_groups = [pack.touch_groups[own] if run.sampler != "shuffle" else None for own in self.rows]
+        grouped = batches.touch_groups is not None
+        self.touch_groups = [pack.touch_groups[own] if grouped else None for own in self.rows]
         self.shares = pack.shares(rows)
-        self.length = run.batch_size if pack.one_part else 1  # rows of one draw
-        self.num = per_epoch * run.batch_size // self.length  # draws of an epoch
+        self.length = self.shape[1] if pack.one_part else 1  # rows of one draw
+        self.num = self.shape[0] * self.shape[1] // self.length  # draws of an epoch
         self.before = [np.zeros(len(self.rows), np.int64)]  # draws of each part before each epoch
 
     def epoch(self, number: int) -> np.ndarray:
@@ -99,33 +94,23 @@ class PartOrder:
 
 
 def check_mix(run: Run, pack: Pack, rows: np.ndarray, world: World) -> None:
-    """Check that ``run`` can train on ``rows`` of ``pack``, if it is a mix.
-
-    ValueError if a part has no rows, or fewer than its weight asks for in a batch, or the rows of a batch have other
-    modalities and are embedded in several places.
-    """
+    """ValueError unless each part of a mix has the rows that a batch asks of it, and batches can be embedded as asked."""
     if not isinstance(pack, MixedPack):
         return
     sizes = np.bincount(pack.part_of[rows], minlength=len(pack.parts))
     shares = np.ones(len(sizes)) if pack.one_part else pack.shares(rows)
     for name, size, share in zip(pack.parts, sizes.tolist(), shares.tolist(), strict=True):
         if not size:
-            raise ValueError(
-                f"method {run.method.name!r} with its settings learns from no row of part {name}: leave it out"
-            )
+            raise ValueError(f"method {run.method.name!r} learns from no row of part {name}: leave it out")
         if size < share * run.batch_size - 1e-6:
-            raise ValueError(
-                f"part {name} has {size} rows to train on, but {share * run.batch_size:.0f} of a batch of {run.batch_size}"
-                f" are to be of it: a row would be its own negative; give a smaller --batch-size, or a smaller weight"
-            )
+            asked = f"{share * run.batch_size:.0f} of a batch of {run.batch_size}"
+            raise ValueError(f"part {name} has {size} rows to train on, for {asked}: a row would be its own negative")
     senses = np.stack([pack.has(modality)[rows] for modality in pack.spec.modalities])
     if pack.one_part or (senses == senses[:, :1]).all():
         return
     if world.size > 1 or run.chunk:
-        raise ValueError(
-            "parts that lack a modality, in mixed batches, support neither several processes nor --chunk: give"
-            " --data.batches one-part"
-        )
+        how = "support neither several processes nor --chunk: give --data.batches one-part"
+        raise ValueError(f"parts that lack a modality, in mixed batches, {how}")
     if run.batch_size < 3:
         raise ValueError(f"batch_size {run.batch_size}: parts that lack a modality need at least 3")
 
@@ -171,21 +156,14 @@ def _occurrences(groups: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def partners(
-    pack: Pack,
-    rows: np.ndarray,
-    generator: torch.Generator,
-    *,
-    within: float = 0.0,
-    other_sensor: bool = False,
+    pack: Pack, rows: np.ndarray, generator: torch.Generator, *, within: float = 0.0, other_sensor: bool = False
 ) -> np.ndarray:
-    """For each of ``rows`` a random other row of the same touch group and split.
+    """For each of ``rows`` a random other row of the same touch group and split, else the row itself.
 
     With ``within``, its distance in time is at most that; with ``other_sensor``, it is of the same press and another sensor.
-    A row without such others is its own partner.
     """
     of = "presses" if other_sensor else "touch_groups"
-    groups: np.ndarray = getattr(pack, of)
-    split = pack.column("split")
+    groups, split = getattr(pack, of), pack.column("split")
     place = places(pack, pack.spec.window)[1] if within else np.zeros(0)
     draws = torch.rand(len(rows), generator=generator).numpy()
     found = rows.copy()

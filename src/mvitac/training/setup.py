@@ -1,9 +1,8 @@
 """Set-up of pre-training: everything that happens before the first step, and every check that can be made there."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +23,15 @@ from mvitac.nn.imagenet import source
 from mvitac.registry import to_json
 from mvitac.run import Run, load_run, precision_of
 from mvitac.system.device import Hardware, describe, has_bf16, pick_device
-from mvitac.system.distributed import World, local_device, synchronise_norms
+from mvitac.system.distributed import World, local_device
 from mvitac.system.files import brief, check_place, is_temporary, write_json
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training import checkpoint
-from mvitac.training.sampler import Batches, check_mix
+from mvitac.training.sampler import check_mix
 from mvitac.training.start import Start, load_start, read_start, warning
 from mvitac.training.start import describe as describe_start
-from mvitac.training.step import Chunk, Step
+from mvitac.training.step import Step
 from mvitac.training.views import StepViews, values_of
 
 
@@ -40,8 +39,7 @@ from mvitac.training.views import StepViews, values_of
 class Setup:
     """What the training loop works with."""
 
-    asked: Run  # the run as it was given
-    run: Run  # the same with ``precision`` resolved for this machine
+    run: Run  # with ``precision`` resolved for this machine
     pack: Pack
     rows: np.ndarray  # pack rows to train on
     hardware: Hardware
@@ -50,13 +48,8 @@ class Setup:
     views: StepViews
     step: Step
     start: int  # number of steps that are already done
-    num_steps: int
     kept: dict[str, Any]  # state of validation (``Validation``)
     spec: DataSpec  # that of ``pack``, with the sensors that the model met
-
-    def chunks(self, start: int, num_steps: int) -> Iterator[list[Chunk]]:
-        """The chunks of each step from ``start`` to ``num_steps``."""
-        return self.views.each(Batches(self.run, self.pack, self.rows), start, num_steps)
 
 
 def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | None) -> Setup | None:
@@ -64,7 +57,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     asked = replace(asked, init=asked.init.resolved())
     device = pick_device(local_device(asked.device))
     pack = open_pack(asked.data, world, quiet) if pack is None else pack
-    rows = check(asked, pack, world)
+    rows = _rows(asked, pack, world)
     resumed = (out / "run.json").exists()
     hardware = _hardware(asked, pack, device, world, out if resumed else None)
     run = replace(asked, precision=hardware.precision)
@@ -72,27 +65,25 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
         return None
 
     start = read_start(run.init)
-    method, taken = _build_method(run, pack, rows, device, world, start)
+    method, taken = _build_method(run, pack, rows, device, start)
     step = Step(run, method, device, world)
     done, kept = checkpoint.restore(out, run, method, step.optimiser, world)
     locked = {m: t for m, t in method.encoders().items() if is_locked(t) and run.augment.of(m).fixed}
     views = StepViews(run, pack, method.views, device, world, {} if run.method.needs_vit else locked)
     before = start.sensors if start and "touch" in taken["taken"] else ()
     spec = replace(pack.spec, sensors=tuple(sorted({*sensors_of(pack, rows), *before})))
-    num_steps = run.num_steps(len(rows))
-    setup = Setup(asked, run, pack, rows, hardware, world, method, views, step, done, num_steps, kept, spec)
+    setup = Setup(run, pack, rows, hardware, world, method, views, step, done, kept, spec)
     # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
     world.same_everywhere([*method.parameters(), *method.buffers()])
     if world.writes:
-        _record(setup, out, start, taken, quiet=quiet)
+        _record(setup, asked, out, start, taken, quiet=quiet)
     return setup
 
 
-def check(run: Run, pack: Pack, world: World) -> np.ndarray:
+def _rows(run: Run, pack: Pack, world: World) -> np.ndarray:
     """The rows of ``pack`` to train on; ValueError if a setting does not fit them, before anything is written."""
     if run.positives_within:
         places(pack, pack.spec.window)
-    run.method.check_pack(pack)
     rows = run.method.training_rows(pack)
     run.check(pack.spec, len(rows), pack.size)
     check_divisible(run, world)
@@ -100,25 +91,25 @@ def check(run: Run, pack: Pack, world: World) -> np.ndarray:
     return rows
 
 
-def _record(setup: Setup, out: Path, start: Start | None, taken: dict[str, Any], *, quiet: bool) -> None:
+def _record(setup: Setup, asked: Run, out: Path, start: Start | None, taken: dict[str, Any], *, quiet: bool) -> None:
     """Write run.json and the hashes of the rows that the run learns from, and say what it starts from."""
-    run, pack, method = setup.run, setup.pack, setup.method
+    run, pack = setup.run, setup.pack
     if not (out / "run.json").exists():
-        data = {"pack": pack.digest, "num_pairs": pack.num, "data": to_json(setup.spec)}
-        record = {"run": to_json(setup.asked), **data, "device": describe(setup.hardware.device)}
-        record |= {"precision": run.precision, "bf16_slowdown": setup.hardware.slowdown}
-        used = {m: run.encoder[m] for m in method.encoders() if run.encoder[m].weights == IMAGENET}
+        record = {
+            **{"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(setup.spec)},
+            **{"device": describe(setup.hardware.device), "precision": run.precision},
+            **{"bf16_slowdown": setup.hardware.slowdown},
+        }
         said = []
-        if imagenet := {m: source(config.trunk) for m, config in used.items()}:
-            record["imagenet"] = imagenet
-            said += [f"{modality} starts from ImageNet weights of {found}" for modality, found in imagenet.items()]
+        used = {m: run.encoder[m] for m in setup.method.encoders() if run.encoder[m].weights == IMAGENET}
+        if used:
+            record["imagenet"] = {m: source(config.trunk) for m, config in used.items()}
+            said += [f"{m} starts from ImageNet weights of {found}" for m, found in record["imagenet"].items()]
         if start:
             record["start"] = taken
             said.append(describe_start(taken))
-        said = [] if quiet else said
-        if found := warning(run, start, pack):
-            said.append(f"warning: {found}")
-        for line in said:
+        found = warning(run, start, pack)
+        for line in [*(said if not quiet else ()), *([f"warning: {found}"] if found else ())]:
             print(f"mvitac: {line}", file=sys.stderr)
         write_json(out / "run.json", {**record, **provenance()}, sealed=True)
     if not (out / FILE).exists():
@@ -136,41 +127,30 @@ def check_out(out: Path, resume: bool) -> None:
         raise ValueError(f"{out} exists and is not a run: choose another --out")
 
 
-def check_still_there(out: Path) -> None:
-    """Raise ValueError if the folder of the run has been deleted or moved since training began."""
-    if not (out / "run.json").exists():
-        raise ValueError(f"{out / 'run.json'} is gone: {out} was deleted or moved during training, start again")
-
-
 def _is_finished(asked: Run, pack: Pack, out: Path, world: World) -> bool:
-    """Return whether the run in ``out`` has its model. A damaged one is made again from the checkpoint.
-
-    ValueError if ``out`` holds another run.
-    """
+    """Whether the run in ``out`` has its model. A damaged one is made again from the checkpoint."""
     check_same(asked, pack, out)
-    if (out / "model.safetensors").exists():
-        try:
-            load(out)
-            if world.writes:
-                (out / checkpoint.PREVIOUS).unlink(missing_ok=True)  # left by a process that was killed at the very end
-            return True
-        except ValueError as error:
-            if not (out / checkpoint.CHECKPOINT).exists():
-                raise ValueError(f"{error} (its checkpoint is gone: delete {out} to train again)") from None
-            if world.writes:
-                print(f"mvitac: {error}; making it again from {out / checkpoint.CHECKPOINT}", file=sys.stderr)
-    return False
+    if not (out / "model.safetensors").exists():
+        return False
+    try:
+        load(out)
+    except ValueError as error:
+        if not (out / checkpoint.CHECKPOINT).exists():
+            raise ValueError(f"{error} (its checkpoint is gone: delete {out} to train again)") from None
+        if world.writes:
+            print(f"mvitac: {error}; making it again from {out / checkpoint.CHECKPOINT}", file=sys.stderr)
+        return False
+    if world.writes:
+        (out / checkpoint.PREVIOUS).unlink(missing_ok=True)  # left by a process that was killed at the very end
+    return True
 
 
 def check_divisible(run: Run, world: World) -> None:
     """Raise ValueError unless each process gets the same number of whole chunks of a batch."""
     multiple = world.size * max(1, run.chunk)
     if run.batch_size % multiple:
-        chunks = f" with chunks of {run.chunk} pairs" if run.chunk else ""
-        raise ValueError(
-            f"batch_size {run.batch_size} is not divisible by {world.size} processes{chunks}:"
-            f" give a multiple of {multiple}"
-        )
+        given = f"batch_size {run.batch_size} is not divisible by {world.size} processes"
+        raise ValueError(f"{given}{f' x chunk {run.chunk}' if run.chunk else ''}: give a multiple of {multiple}")
 
 
 def check_same(run: Run, pack: Pack, out: Path) -> None:
@@ -184,33 +164,33 @@ def check_same(run: Run, pack: Pack, out: Path) -> None:
 
 def _hardware(run: Run, pack: Pack, device: torch.device, world: World, begun: Path | None) -> Hardware:
     """The precision of ``run`` on ``device``. A run that was ``begun`` goes on in its own; auto is bf16 if all agree."""
-    if run.precision == "auto" and begun:
+    if run.precision != "auto":
+        return Hardware.choose(device, run.precision)
+    if begun:
         return Hardware.choose(device, precision_of(*load_run(begun)))
-    measured = run.precision == "auto" and device.type == "cpu" and has_bf16(device)
-    work = partial(_pass, _sample_networks(run, pack, device)) if measured else None
-    made = Hardware.choose(device, run.precision, work)
-    fp32 = run.precision == "auto" and world.anyone(made.precision == "fp32")
+    measured = device.type == "cpu" and has_bf16(device)
+    made = Hardware.choose(device, "auto", _work(run, pack, device) if measured else None)
+    fp32 = world.anyone(made.precision == "fp32")
     return Hardware.choose(device, "fp32") if fp32 and made.precision == "bf16" else made
 
 
-def _sample_networks(run: Run, pack: Pack, device: torch.device) -> list[tuple[torch.nn.Module, torch.Tensor]]:
-    """The trunks of ``run`` with random weights, each with a few images of the size that it is trained on."""
-    found, spec = [], pack.spec
+def _work(run: Run, pack: Pack, device: torch.device) -> Callable[[], None]:
+    """One pass, forward and backward, of the trunks of ``run`` with random weights, on a few images of its size."""
+    networks, spec = [], pack.spec
     with torch.random.fork_rng(devices=[]):
         for m in spec.modalities:
             trunk = build_trunk(replace(run.encoder[m], weights=SCRATCH), spec.channels(m), spec.frames(m)).to(device)
             images = torch.rand(8, spec.channels(m), *[run.augment.size_of(m)] * 2, device=device)
             trunk.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-            found.append((trunk, images.to(memory_format=torch.channels_last)))
-    return found
+            networks.append((trunk, images.to(memory_format=torch.channels_last)))
 
+    def work() -> None:
+        for trunk, images in networks:
+            features = trunk(images)
+            if features.requires_grad:
+                features.float().sum().backward()
 
-def _pass(networks: list[tuple[torch.nn.Module, torch.Tensor]]) -> None:
-    """Forward and, of trunks that are trained, backward."""
-    for trunk, images in networks:
-        features = trunk(images)
-        if features.requires_grad:
-            features.float().sum().backward()
+    return work
 
 
 def open_pack(data: DatasetConfig, world: World, quiet: bool) -> Pack:
@@ -224,7 +204,7 @@ def open_pack(data: DatasetConfig, world: World, quiet: bool) -> Pack:
 
 
 def _build_method(
-    run: Run, pack: Pack, rows: np.ndarray, device: torch.device, world: World, start: Start | None
+    run: Run, pack: Pack, rows: np.ndarray, device: torch.device, start: Start | None
 ) -> tuple[Method, dict[str, Any]]:
     """The method of ``run`` with fresh or start weights, on ``device``, and what was taken of ``start``."""
     if device.type == "cpu":
@@ -236,21 +216,16 @@ def _build_method(
     method.learn_scale(values_of(run, pack, rows))
     method.to(device).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     _check_image_size(method, run, pack)
-    synchronise_norms(method, world)
     return method, taken
 
 
-@torch.no_grad()
 def _check_image_size(method: Method, run: Run, pack: Pack) -> None:
     """Pass two blank images through each trunk, because not every trunk supports every image size."""
     model = Model(method, run, pack.spec, pack.size)
     for modality, trunk in model.encoders.items():
-        device = next(trunk.parameters()).device
-        blank = torch.zeros(2, pack.spec.channels(modality), pack.size, pack.size, dtype=torch.uint8, device=device)
+        shape, device = (2, pack.spec.channels(modality), pack.size, pack.size), next(trunk.parameters()).device
         try:
-            model.features(modality, blank)
+            model.features(modality, torch.zeros(shape, dtype=torch.uint8, device=device))
         except Exception as error:  # the type differs between trunks
-            raise ValueError(
-                f"trunk {run.encoder[modality].trunk} does not support images of {model.sides(modality)[0]} px"
-                f" ({brief(error)}): give another --augment.size or --encoder.trunk"
-            ) from None
+            given = f"trunk {run.encoder[modality].trunk} does not support images of {model.sides(modality)[0]} px"
+            raise ValueError(f"{given} ({brief(error)}): give another --augment.size or --encoder.trunk") from None

@@ -1,17 +1,17 @@
 """Start weights from another model (``Run.init``): read them, load what fits, and say what that model learned from."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from torch import Tensor
 
 from mvitac.data.pack import Pack
+from mvitac.data.spec import MODALITIES
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, file_source, read_sources, unknown_source, weights_files
 from mvitac.methods.base import Method
 from mvitac.model_files import load
-from mvitac.nn.initial import MODEL, Init, fits, load_trunk
+from mvitac.nn.initial import Init, fits, load_trunk
 from mvitac.nn.momentum import Momentum
 from mvitac.nn.weights import FORMAT, read_safetensors
 from mvitac.run import Run
@@ -38,28 +38,23 @@ def read_start(init: Init) -> Start | None:
         return None
     header, tensors = read_safetensors(init.file)
     if header.get("format") == FORMAT:
-        model = load(init.file)
+        model, folder = load(init.file), init.file.parent
         trunks = {m: trunk.state_dict() for m, trunk in model.encoders.items()}
         heads = {m: head.state_dict() for m, head in model.projectors.items()}
-        learned = _learned(init.file)
+        # Only the folder of a run or an artifact knows what its model learned from: a copied file is unknown.
+        own = init.file.name.startswith("model.") and (folder / "run.json").exists()
+        found = read_sources(folder) if own else None
+        learned = [unknown_source(folder.name if own else init.file.name)] if found is None else found
         return Start(init, trunks, heads, model.run.encoder.named(model.encoders), learned, model.spec.sensors)
-    trunks = {m: _below(f"encoders.{m}.", tensors) for m in ("vision", "touch")}
-    heads = {m: state for m in trunks if (state := _below(f"projectors.{m}.", tensors))}
-    trunks = {m: state for m, state in trunks.items() if state} or {ANY: tensors}
-    return Start(init, trunks, heads, "", [file_source(init.file)])
+    trunks, heads = (
+        {m: found for m in MODALITIES if (found := _below(f"{kind}.{m}.", tensors))}
+        for kind in ("encoders", "projectors")
+    )
+    return Start(init, trunks or {ANY: tensors}, heads, "", [file_source(init.file)])
 
 
 def _below(prefix: str, tensors: State) -> State:
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-
-
-def _learned(file: Path) -> list[Source]:
-    """What the model in ``file`` learned from. Only its own folder knows: a copied file is unknown."""
-    folder = file.parent
-    if not file.name.startswith(MODEL.split(".")[0]) or not (folder / "run.json").exists():
-        return [unknown_source(file.name)]
-    found = read_sources(folder)
-    return [unknown_source(folder.name)] if found is None else found
 
 
 def load_start(start: Start, method: Method) -> dict[str, Any]:
@@ -71,10 +66,13 @@ def load_start(start: Start, method: Method) -> dict[str, Any]:
     init, taken, reasons = start.init, {}, {}
     trunks, heads = method.encoders(), method.projectors()
     for modality in init.modalities or trunks:
+        state = start.trunks.get(modality, start.trunks.get(ANY))
         try:
-            _load_encoder(start, trunks, modality)
+            if state is None:
+                raise ValueError(f"it has {' and '.join(start.trunks)} only")
+            load_trunk(trunks[modality], state, init.path or "")
         except ValueError as error:
-            reasons[modality] = str(error)
+            reasons[modality] = f"its trunk is {start.trunk}, {error}" if start.trunk and state else str(error)
             continue
         taken[modality] = ["trunk"]
         if init.heads and modality in heads and fits(heads[modality], start.heads.get(modality, {})):
@@ -82,27 +80,14 @@ def load_start(start: Start, method: Method) -> dict[str, Any]:
             taken[modality].append("head")
     if reasons and (init.modalities or not taken):
         why = "; ".join(f"{modality}: {reason}" for modality, reason in reasons.items())
-        hint = "give another --init" if taken else "give weights of the same --encoder.trunk"
-        raise ValueError(f"init {init.path} does not fit this run ({why}): {hint}")
+        raise ValueError(f"init {init.path} does not fit this run ({why}): give weights of the same --encoder.trunk")
     for module in method.modules():
         if isinstance(module, Momentum):
-            module.restart()
+            module.follow(0.0)  # a copy of what was loaded
     names = list(dict.fromkeys(source.name for source in start.sources))
     assert init.path
     found = {"name": init.path.name, "digest": init.digest, "taken": taken, "trained_on": names}
     return {**found, **({"not_taken": reasons} if reasons else {})}
-
-
-def _load_encoder(start: Start, trunks: dict[str, Any], modality: str) -> None:
-    if modality not in trunks:
-        raise ValueError("this run has no such encoder")
-    state = start.trunks.get(modality, start.trunks.get(ANY))
-    if state is None:
-        raise ValueError(f"it has {' and '.join(start.trunks)} only")
-    try:
-        load_trunk(trunks[modality], state, start.init.path or "")
-    except ValueError as error:
-        raise ValueError(f"its trunk is {start.trunk}, {error}" if start.trunk else str(error)) from None
 
 
 def describe(record: dict[str, Any]) -> str:
@@ -117,8 +102,7 @@ def warning(run: Run, start: Start | None, pack: Pack) -> str:
     sources = [*(start.sources if start else []), *map(file_source, weights_files(run))]
     if not sources:
         return ""
-    tasks = pack.spec.all_tasks
-    tested = [pack.rows("test", only=task.only, by=task.split) for task in tasks] or [pack.rows("test")]
+    tested = [pack.rows("test", only=task.only, by=task.split) for task in pack.spec.all_tasks] or [pack.rows("test")]
     rows = np.unique(np.concatenate(tested))
     leak = Scored(pack).leak(sources, rows) if len(rows) else ""
     path = start.init.path if start else ", ".join(map(str, weights_files(run)))

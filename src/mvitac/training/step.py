@@ -9,13 +9,11 @@ its running statistics are updated once per chunk.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from timm.optim import param_groups_layer_decay  # pyright: ignore[reportPrivateImportUsage]
-from torch import Tensor
+from torch import Tensor, nn
 
-from mvitac.data.spec import MODALITIES
 from mvitac.methods.base import Contrastive, Embeddings, Method, Views
 from mvitac.nn.encoders import Encoders, PerFrame
 from mvitac.run import Optim, Run
@@ -32,14 +30,14 @@ class Step:
     """
 
     def __init__(self, run: Run, method: Method, device: torch.device, world: World | None = None) -> None:
-        self.method, self.device, self.world = method, device, world or World()
-        self.bf16 = run.bf16
+        self.method, self.device, self.world, self.bf16 = method, device, world or World(), run.bf16
+        if self.world.size > 1 and device.type == "cuda":  # torch has none for CPUs
+            nn.SyncBatchNorm.convert_sync_batchnorm(method)
         self.optimiser = build_optimiser(run.optim, method, run.encoder)
         if (run.chunk or self.world.size > 1) and not isinstance(method, Contrastive):
-            raise ValueError(
-                f"method {run.method.name!r} supports neither several processes nor --chunk: leave them out"
-            )
-        set_precision(run.precision)
+            raise ValueError(f"method {run.method.name!r} supports neither several processes nor --chunk")
+        # fp32 is IEEE fp32; bf16 is autocast, and its remaining fp32 is IEEE fp32.
+        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = run.precision == "tf32"
         self.forward = torch.compile(method, fullgraph=True) if run.compile else method
 
     def __call__(self, chunks: Sequence[Chunk], *, lr: float, seed: int, progress: float) -> dict[str, Tensor]:
@@ -74,56 +72,44 @@ class Step:
         statistics = [] if single else _running_statistics(method)
         before = [buffer.clone() for buffer in statistics]
 
+        def embed(views: Views, i: int) -> Embeddings:
+            torch.manual_seed(first_seed + i)
+            with self.autocast():
+                return method.queries(views)
+
         # First pass: embed every chunk.
         queries, keys = [], []
         for i, chunk in enumerate(chunks):
             views = chunk()
             with torch.set_grad_enabled(single):
-                queries.append(self._queries(views, first_seed + i))
+                queries.append(embed(views, i))
             with torch.no_grad(), self.autocast():
                 keys.append(method.keys(views))
 
-        # Losses over all embeddings, and the gradient of each embedding of this process.
-        losses, gradients = self._contrast(queries, keys, seed)
+        # Losses over the embeddings of all processes, and the gradient of each of this process. Every process computes the
+        # whole loss, so that this needs no communication.
+        own = {name: torch.cat([z[name].detach() for z in queries]) for name in queries[0]}
+        all_queries = {name: world.gather(z).requires_grad_() for name, z in own.items()}
+        all_keys = {name: world.gather(torch.cat([z[name] for z in keys])) for name in keys[0]}
+        torch.manual_seed(seed)  # what losses draw (CMC's negatives) is the same on every process
+        with self.autocast():
+            losses = method.contrast(all_queries | all_keys)
+        found = torch.autograd.grad(losses["loss"], list(all_queries.values()), allow_unused=True)
+        sizes = [len(next(iter(z.values()))) for z in queries]
+        gradients = {  # none of an embedding whose loss is not part of the sum
+            name: gradient.split(len(own[name]))[world.rank].split(sizes)
+            for name, gradient in zip(all_queries, found, strict=True)
+            if gradient is not None
+        }
 
         # Second pass: embed every chunk again, and propagate the gradients of its embeddings to the parameters.
         for buffer, old in zip(statistics, before, strict=True):
             buffer.copy_(old)  # this pass updates them again
         for i, chunk in enumerate(chunks):
-            z = queries[i] if single else self._queries(chunk(), first_seed + i)
-            torch.autograd.backward([z[name] for name in gradients[i]], list(gradients[i].values()))
+            z = queries[i] if single else embed(chunk(), i)
+            torch.autograd.backward([z[name] for name in gradients], [pieces[i] for pieces in gradients.values()])
         world.sum_gradients(method)
         return losses
-
-    def _queries(self, views: Views, seed: int) -> Embeddings:
-        assert isinstance(self.method, Contrastive)
-        torch.manual_seed(seed)
-        with self.autocast():
-            return self.method.queries(views)
-
-    def _contrast(
-        self, queries: list[Embeddings], keys: list[Embeddings], seed: int
-    ) -> tuple[dict[str, Tensor], list[Embeddings]]:
-        """Losses over the embeddings of all processes, and their gradients for ``queries``, chunk by chunk.
-
-        Every process computes the whole loss, so the gradient of its own embeddings needs no communication.
-        """
-        assert isinstance(self.method, Contrastive)
-        own = {name: torch.cat([z[name].detach() for z in queries]) for name in queries[0]}
-        all_queries = {name: self.world.gather(z).requires_grad_() for name, z in own.items()}
-        all_keys = {name: self.world.gather(torch.cat([z[name] for z in keys])) for name in keys[0]}
-        torch.manual_seed(seed)  # what losses draw (CMC's negatives) is the same on every process
-        with self.autocast():
-            losses = self.method.contrast(all_queries | all_keys)
-        # An embedding gets no gradient if its loss is not part of the sum.
-        found = torch.autograd.grad(losses["loss"], list(all_queries.values()), allow_unused=True)
-        sizes = [len(next(iter(z.values()))) for z in queries]
-        by_name = {
-            name: self.world.own(gradient, len(own[name])).split(sizes)
-            for name, gradient in zip(all_queries, found, strict=True)
-            if gradient is not None
-        }
-        return losses, [{name: pieces[i] for name, pieces in by_name.items()} for i in range(len(queries))]
 
 
 def _running_statistics(method: Method) -> list[Tensor]:
@@ -133,53 +119,39 @@ def _running_statistics(method: Method) -> list[Tensor]:
 
 
 def build_optimiser(config: Optim, method: Method, encoders: Encoders) -> torch.optim.Optimizer:
-    """Create the optimiser of the trainable parameters (momentum copies have none). Uses a fused kernel if available."""
-    parameters: Any = [p for p in method.parameters() if p.requires_grad]
+    """Create the optimiser of the trainable parameters (momentum copies have none). Uses a fused kernel if available.
+
+    Its groups are those of equal weight decay and equal share of the learning rate (lr_scale).
+    """
+    parameters = [p for p in method.parameters() if p.requires_grad]
     fused = all(p.device.type in ("cpu", "cuda") and p.is_floating_point() for p in parameters)
-    if scales := _scales(method, encoders):
-        parameters = _by_scale(config, parameters, scales)
-    elif config.weight_decay and not config.decay_norms:
-        vectors = [p for p in parameters if p.ndim <= 1]  # biases and BatchNorm
-        matrices = [p for p in parameters if p.ndim > 1]
-        parameters = [{"params": matrices}, {"params": vectors, "weight_decay": 0.0}]
+    scales = _scales(method, encoders)
+    groups: dict[tuple[float, bool], list[Tensor]] = {}
+    for p in parameters:  # biases and the parameters of BatchNorm are vectors
+        groups.setdefault((scales.get(id(p), 1.0), p.ndim > 1 or config.decay_norms), []).append(p)
+    given = [
+        {"params": found, "lr_scale": scale, "weight_decay": config.weight_decay * decayed}
+        for (scale, decayed), found in groups.items()
+    ]
     if config.name == "sgd":
-        return torch.optim.SGD(parameters, config.lr, momentum=0.9, weight_decay=config.weight_decay, fused=fused)
+        return torch.optim.SGD(given, config.lr, momentum=0.9, fused=fused)
     kind = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[config.name]
-    return kind(parameters, config.lr, eps=config.eps, weight_decay=config.weight_decay, fused=fused)
+    return kind(given, config.lr, eps=config.eps, fused=fused)
 
 
 def _scales(method: Method, encoders: Encoders) -> dict[int, float]:
     """id -> learning rate relative to that of the heads, of the parameters of trunks that are not trained like them."""
     scales: dict[int, float] = {}
-    for name in MODALITIES:
+    for name, encoder in method.encoders().items():
         config = encoders[name]
-        if config.lr_scale == config.layer_decay == 1 or name not in method.encoders():
-            continue
-        encoder = method.encoders()[name]
         scales |= dict.fromkeys(map(id, encoder.parameters()), config.lr_scale)
+        if config.layer_decay == 1:
+            continue
         trunk = encoder.trunk if isinstance(encoder, PerFrame) else encoder
-        if config.layer_decay < 1 and not hasattr(trunk, "group_matcher"):
+        if not hasattr(trunk, "group_matcher"):
             raise ValueError(f"the trunk of {name} names no layers: leave out --encoder.{name}.layer-decay")
         # timm gives a trunk without its classifier's layer the full rate at the end; here the heads are that layer.
-        for group in param_groups_layer_decay(trunk, layer_decay=config.layer_decay) if config.layer_decay < 1 else ():
+        for group in param_groups_layer_decay(trunk, layer_decay=config.layer_decay):
             scale = config.lr_scale * config.layer_decay * group["lr_scale"]
             scales |= {id(p): scale for p in group["params"]}
     return scales
-
-
-def _by_scale(config: Optim, parameters: list[Tensor], scales: dict[int, float]) -> list[dict[str, Any]]:
-    """Groups of ``parameters`` with equal weight decay and equal share of the learning rate (lr_scale)."""
-    groups: dict[tuple[float, bool], list[Tensor]] = {}
-    for p in parameters:
-        groups.setdefault((scales.get(id(p), 1.0), p.ndim > 1 or config.decay_norms), []).append(p)
-    return [
-        {"params": found, "lr_scale": scale, "weight_decay": config.weight_decay if decayed else 0.0}
-        for (scale, decayed), found in groups.items()
-    ]
-
-
-def set_precision(precision: str) -> None:
-    """Allow TF32 for precision tf32 only. fp32 is IEEE fp32; bf16 is autocast, and its remaining fp32 is IEEE fp32."""
-    tf32 = precision == "tf32"
-    torch.backends.cuda.matmul.allow_tf32 = tf32
-    torch.backends.cudnn.allow_tf32 = tf32

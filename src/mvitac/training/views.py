@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Pack
 from mvitac.methods.base import Views
+from mvitac.nn.encoders import num_features
 from mvitac.run import Run
 from mvitac.system.distributed import World
 from mvitac.training.loader import Feed, ahead, prefetch
@@ -67,40 +68,39 @@ class StepViews:
 
     def make(self, rows: np.ndarray, seed: int) -> Views:
         """Views of pack rows [B] on the device, in the precision that the networks read them in."""
-        run, pack, generator = self.run, self.pack, torch.Generator().manual_seed(seed)
+        run, pack, generator, to = self.run, self.pack, torch.Generator().manual_seed(seed), self.device
         sources = self._sources(rows, generator)
-        has, both = senses(pack, rows), {}
+        has, both = _senses(pack, rows), {}
         if not all(there.all() for there in has.values()):
             pairs = np.logical_and.reduce(list(has.values()))
-            both = {m: torch.from_numpy(np.flatnonzero(pairs[there])).to(self.device) for m, there in has.items()}
-            sources = {m: _some(sources[m], there) for m, there in has.items()}
+            both = {m: torch.from_numpy(np.flatnonzero(pairs[there])).to(to) for m, there in has.items()}
         dtype = torch.bfloat16 if run.bf16 else torch.float32
         images: dict[str, list[Tensor]] = {}
-        for m in has:
+        for m, there in has.items():
+            own = {id(source): source[there] for source in sources[m]}  # an image of two views is loaded once
             if m in self.locked:
                 for source in sources[m]:  # the other modality's views stay the same
-                    draw(run.augment.of(m), len(source), pack.size, generator)
-                images[m] = [self.locked[m](source) for source in sources[m]]
-                continue
-            different = {id(source): source for source in sources[m]}  # an image of two views is loaded once
-            fed = {name: self.feed(m, source) for name, source in different.items()}
+                    draw(run.augment.of(m), len(own[id(source)]), pack.size, generator)
+            load = self.locked.get(m, partial(self.feed, m))
+            fed = {name: load(source) for name, source in own.items()}
             how = run.augment.of(m), run.augment.size_of(m), generator, dtype, run.encoder[m].levels
-            images[m] = [random_view(fed[id(source)], *how) for source in sources[m]]
+            images[m] = [
+                fed[id(source)] if m in self.locked else random_view(fed[id(source)], *how) for source in sources[m]
+            ]
         splits = run.method.label_splits
-        labels = {t.name: torch.from_numpy(pack.labels(t.name, *splits)[rows]).to(self.device) for t in pack.spec.tasks}
-        values = {task: value.to(self.device) for task, value in values_of(run, pack, rows).items()}
-        at, drawn = torch.from_numpy(rows).to(self.device), torch.tensor(seed).to(self.device)
-        return Views(images=images, labels=labels, rows=at, values=values, both=both, seed=drawn)
+        labels = {t.name: torch.from_numpy(pack.labels(t.name, *splits)[rows]).to(to) for t in pack.spec.tasks}
+        values = {task: value.to(to) for task, value in values_of(run, pack, rows).items()}
+        return Views(images, labels, torch.from_numpy(rows).to(to), values, both, torch.tensor(seed).to(to))
 
     def _sources(self, rows: np.ndarray, generator: torch.Generator) -> dict[str, list[np.ndarray]]:
         """Modality -> the rows that each of its views shows (``Run.positives``)."""
         run, pack = self.run, self.pack
-        views = [rows] * self.num
+        views, others = [rows] * self.num, partial(partners, pack, rows, generator, within=run.positives_within)
         if run.positives != "same-image":
-            views[1:] = [partners(pack, rows, generator, within=run.positives_within) for _ in views[1:]]
+            views[1:] = [others() for _ in views[1:]]
         sources = dict.fromkeys(pack.spec.modalities, views)
         if run.positives == "same-touch-pairs" and self.num == 1:
-            sources["touch"] = [partners(pack, rows, generator, within=run.positives_within)]
+            sources["touch"] = [others()]
         if run.method.sensor_view:
             sources["touch"] = [*sources["touch"], partners(pack, rows, generator, other_sensor=True)]
         return sources
@@ -115,31 +115,22 @@ class LockedFeatures:
     def __init__(self, run: Run, feed: Feed, modality: str, trunk: nn.Module) -> None:
         self.run, self.feed, self.modality, self.trunk = run, feed, modality, trunk
         self.known = np.zeros(feed.pack.num, bool)
-        self.table = torch.zeros(feed.pack.num, int(trunk.num_features), device=feed.device)  # type: ignore[arg-type]
-
-    def __call__(self, rows: np.ndarray) -> Tensor:
-        """Features [B, D] of ``rows``, on the device."""
-        for block in np.unique(rows[~self.known[rows]] // BLOCK):
-            there = self.feed.pack.has(self.modality)[block * BLOCK : (block + 1) * BLOCK]
-            self._compute(block * BLOCK + np.flatnonzero(there))
-        return self.table[torch.from_numpy(rows).to(self.table.device)]
+        self.table = torch.zeros(feed.pack.num, num_features(trunk), device=feed.device)
 
     @torch.no_grad()
-    def _compute(self, rows: np.ndarray) -> None:
+    def __call__(self, rows: np.ndarray) -> Tensor:
+        """Features [B, D] of ``rows``, on the device."""
         run, m = self.run, self.modality
-        view = plain_view(self.feed(m, rows), run.augment.size_of(m), run.encoder[m].levels)
-        with torch.autocast(view.device.type, torch.bfloat16, enabled=run.bf16):
-            self.table[torch.from_numpy(rows).to(view.device)] = self.trunk(view).float()
-        self.known[rows] = True
+        for block in np.unique(rows[~self.known[rows]] // BLOCK):
+            new = block * BLOCK + np.flatnonzero(self.feed.pack.has(m)[block * BLOCK : (block + 1) * BLOCK])
+            view = plain_view(self.feed(m, new), run.augment.size_of(m), run.encoder[m].levels)
+            with torch.autocast(view.device.type, torch.bfloat16, enabled=run.bf16):
+                self.table[torch.from_numpy(new).to(view.device)] = self.trunk(view).float()
+            self.known[new] = True
+        return self.table[torch.from_numpy(rows).to(self.table.device)]
 
 
-def _some(sources: list[np.ndarray], kept: np.ndarray) -> list[np.ndarray]:
-    """The rows ``kept`` of each of ``sources``. What was one array twice still is."""
-    fewer = {id(source): source[kept] for source in sources}
-    return [fewer[id(source)] for source in sources]
-
-
-def senses(pack: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
+def _senses(pack: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
     """Modality -> bool [B], which of ``rows`` have an image. Of a mix, modalities of fewer than two rows are left out."""
     if not pack.parts:
         return dict.fromkeys(pack.spec.modalities, np.ones(len(rows), bool))

@@ -56,9 +56,8 @@ class Preprocess:
         """
         given, free = single_images(images, self.modality, clips=self.channels if self.frames > 1 else 0), [None]
         if background is not None:
-            free = [
-                to_array(x, self.channels // self.frames, "background") for x in single_images(background, "background")
-            ]
+            each = self.channels // self.frames
+            free = [to_array(x, each, "background") for x in single_images(background, "background")]
         if len(free) not in (1, len(given)):
             raise ValueError(f"background: got {len(free)} images for {len(given)} of touch: give one, or one for each")
         for start in range(0, len(given), num):
@@ -67,29 +66,23 @@ class Preprocess:
             yield torch.from_numpy(batch).permute(0, 3, 1, 2)
 
     def _stored(self, image: Any, background: np.ndarray | None) -> np.ndarray:
-        """One image of any kind as a new uint8 array [stored, stored, channels], as a pack would store it."""
-        if self.frames > 1:
-            frames = [self._frame(frame, background) for frame in self._clip(image)]
-            return np.concatenate(frames[::-1], axis=2)
-        return self._frame(image, background)
-
-    def _frame(self, image: Any, background: np.ndarray | None) -> np.ndarray:
-        array = to_array(image, self.channels // self.frames, self.modality)
-        return np.array(fit(array if background is None else difference(array, background), self.stored))
+        """One image of any kind, or one clip, as a new uint8 array [stored, stored, channels], as a pack would store it."""
+        frames, each = [], self.channels // self.frames
+        for frame in self._clip(image) if self.frames > 1 else [image]:
+            array = to_array(frame, each, self.modality)
+            frames.append(np.array(fit(array if background is None else difference(array, background), self.stored)))
+        return np.concatenate(frames[::-1], axis=2)
 
     def _clip(self, value: Any) -> list[Any]:
         """The frames of one clip, oldest first; a window as a pack stores it, [H, W, C] of all frames, is taken apart."""
         each = self.channels // self.frames
         if isinstance(value, np.ndarray) and value.ndim == 3 and value.shape[2] == self.channels:
             return [value[:, :, f * each : (f + 1) * each] for f in reversed(range(self.frames))]
-        single = isinstance(value, (str, os.PathLike, Image.Image))
-        single |= isinstance(value, (np.ndarray, Tensor)) and value.ndim < 4
-        frames = [] if single else list(value)
+        frames = [value] if _is_image(value) else list(value)
         if len(frames) != self.frames:
-            got = "a single image" if single else f"{len(frames)} frames"
+            how = f"give clips [{self.frames}, H, W, {each}], oldest first, or lists of {self.frames} images"
             raise ValueError(
-                f"{self.modality}: this model looks at {self.frames} frames at once, got {got}: give clips"
-                f" [{self.frames}, H, W, {each}], oldest first, or lists of {self.frames} images"
+                f"{self.modality}: this model looks at {self.frames} frames at once, got {len(frames)}: {how}"
             )
         return frames
 
@@ -97,17 +90,11 @@ class Preprocess:
 def single_images(value: ImageInput, what: str, *, clips: int = 0) -> list[Any]:
     """The images in any input of ``Model.embed``, as they are. ``what`` names it in errors.
 
-    ``clips``: channels of a window, if they are clips; 0 for images.
+    ``clips``: channels of a window, if they are clips [F, H, W, C], or [H, W, F C] as a pack stores windows; 0 for images.
     """
-    if isinstance(value, (str, os.PathLike, Image.Image)):
-        return [value]
-    many = (1, 4)
-    if clips:  # [N, F, H, W, C], or [N, H, W, F C] as a pack stores windows
-        windows = isinstance(value, np.ndarray) and value.ndim == 4 and value.shape[3] == clips
-        many = (1, 4, 5) if windows else (1, 5)
-        if isinstance(value, (list, tuple)) and value and _is_frame(value[0]):
-            return [value]
-    if isinstance(value, (np.ndarray, Tensor)) and value.ndim not in many:
+    windows = isinstance(value, np.ndarray) and value.ndim == 4 and value.shape[3] == clips
+    listed = isinstance(value, (list, tuple)) and bool(value) and _is_image(value[0])
+    if _is_image(value) or (clips and not windows and (listed or getattr(value, "ndim", 0) == 4)):
         return [value]
     if isinstance(value, (bytes, dict)) or not isinstance(value, Iterable):
         raise ValueError(f"{what}: expected one image or several, got {type(value).__name__}")
@@ -116,11 +103,10 @@ def single_images(value: ImageInput, what: str, *, clips: int = 0) -> list[Any]:
     return images
 
 
-def _is_frame(value: Any) -> bool:
-    """Whether ``value`` is one frame, and so the list that it is in is one clip."""
-    if isinstance(value, (np.ndarray, Tensor)):
-        return value.ndim < 4
-    return isinstance(value, (str, os.PathLike, Image.Image))
+def _is_image(value: Any) -> bool:
+    """Whether ``value`` is one image, and so a list that it is in may be one clip."""
+    pixels = isinstance(value, (np.ndarray, Tensor)) and value.ndim in (0, 2, 3)
+    return pixels or isinstance(value, (str, os.PathLike, Image.Image))
 
 
 def to_array(image: Any, channels: int, what: str) -> np.ndarray:
@@ -139,9 +125,7 @@ def to_array(image: Any, channels: int, what: str) -> np.ndarray:
     if not known or image.ndim != 3:
         shown = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
         raise ValueError(f"{what}: expected uint8 images, or floats in [0, 1], with {channels} channels, got {shown}")
-    if 0 in image.shape:
-        raise ValueError(f"{what}: got an image of shape {image.shape}, which has no pixels")
-    if channels not in (image.shape[0], image.shape[2]):
+    if 0 in image.shape or channels not in (image.shape[0], image.shape[2]):
         raise ValueError(f"{what}: this model takes {channels} channels, got an image of shape {image.shape}")
     if image.shape[0] == channels and (first or image.shape[2] != channels):
         image = image.transpose(1, 2, 0)
@@ -154,10 +138,8 @@ def to_array(image: Any, channels: int, what: str) -> np.ndarray:
 def check_range(low: float, high: float, dtype: Any, what: str) -> None:
     """Raise ValueError if floats from ``low`` to ``high`` are no levels in [0, 1]."""
     if not (low >= -TOLERANCE and high <= 1 + TOLERANCE):
-        raise ValueError(
-            f"{what}: expected floats in [0, 1] or uint8, got {dtype} from {low:.3g} to {high:.3g}: the model normalises"
-            " images itself, give them as they come from the camera (levels 0 to 255 as uint8)"
-        )
+        got = f"got {dtype} from {low:.3g} to {high:.3g}"
+        raise ValueError(f"{what}: expected floats in [0, 1] or uint8, {got}: the model normalises images itself")
 
 
 def check_images(images: Tensor, channels: int, what: str) -> None:
@@ -165,10 +147,8 @@ def check_images(images: Tensor, channels: int, what: str) -> None:
     known = isinstance(images, Tensor) and (images.dtype == torch.uint8 or images.is_floating_point())
     if not known or images.ndim != 4 or images.shape[1] != channels or not images.numel():
         shown = f"{images.dtype} {list(images.shape)}" if isinstance(images, Tensor) else type(images).__name__
-        raise ValueError(
-            f"{what}: expected a tensor [B, {channels}, H, W], uint8 or float in [0, 1], got {shown}"
-            " (`embed` takes any image)"
-        )
+        asked = f"expected a tensor [B, {channels}, H, W], uint8 or float in [0, 1]"
+        raise ValueError(f"{what}: {asked}, got {shown} (`embed` takes any image)")
     if images.dtype != torch.uint8:
         low, high = images.detach().aminmax()
         check_range(float(low), float(high), images.dtype, what)

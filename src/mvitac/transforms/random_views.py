@@ -15,6 +15,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from tyro.conf import Fixed
 
+from mvitac.registry import check_range
+
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 Levels = tuple[tuple[float, ...], tuple[float, ...]]
@@ -50,11 +52,8 @@ class ViewAugment:
     def __post_init__(self) -> None:
         if not 0 < self.scale[0] <= self.scale[1] <= 1:
             raise ValueError(f"augment scale {self.scale}: give two fractions of the area, 0 < low <= high <= 1")
-        for name in ("flip", "grayscale"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"augment {name} {getattr(self, name)} is not a probability: give 0 to 1")
-        if not 0 <= self.jitter < 1:
-            raise ValueError(f"augment jitter {self.jitter}: give a strength in [0, 1)")
+        check_range(self, 0, 1, "flip", "grayscale")
+        check_range(self, 0, 0.99, "jitter")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,7 +150,7 @@ def _one_by_one(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype, lev
         tones = pixels.reshape(size, -1).float()
         if jittered[i]:
             sensors = pixels.permute(2, 0, 1).unflatten(0, (-1, 3))[None].float().div_(255)
-            one = Drawn(*(getattr(drawn, name)[i : i + 1] for name in ("boxes", "flip", "grayscale", "gains")))
+            one = Drawn(*(values[i : i + 1] for values in vars(drawn).values()))
             tones = _colour(sensors, one)[0].mul_(255).permute(2, 3, 0, 1).reshape(size, -1)
         elif drawn.grayscale[i]:
             tones = (tones.view(-1, 3) @ luma)[:, None].expand(-1, 3).reshape(size, -1)
