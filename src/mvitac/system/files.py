@@ -31,9 +31,11 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, sync: bool 
             if sync:
                 os.fsync(file.fileno())
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         with contextlib.suppress(OSError):
             temporary.unlink()
+        if isinstance(error, OSError) and error.errno is None:  # numpy's "1000 requested and 0 written" on a full disk
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
         raise
 
 
@@ -57,12 +59,10 @@ def _remove_orphans(path: Path) -> None:
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Name ``path`` in errors of writing it: that of a full disk has no file name, and numpy's not even a number."""
+    """Name ``path`` in errors of writing it, because that of a full disk has no file name."""
     try:
         yield
     except OSError as error:
-        if error.errno is None:  # "1000 requested and 0 written"
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
         error.filename = error.filename or str(path)
         raise
 
