@@ -380,7 +380,7 @@ def test_files(
 # -- places -----------------------------------------------------------------------------------------------------------
 
 PLACES = {
-    "{tmp}/file/below": "not a folder",
+    "{tmp}/file/below": "Not a directory",
     "{tmp}/" + "n" * 300: "too long",
     "/proc/mvitac-out": "/proc/mvitac-out",
     "{tmp}/mine": "{tmp}/mine",
