@@ -143,10 +143,16 @@ def test_predict_command(
     assert table.column("contact").to_pylist() == [False] * FREE + [True] * (NUM - FREE)
     assert main([*command, str(pack.path), "--out", str(out)]) == 0
     assert pyarrow.csv.read_csv(out).num_rows == pack.num
+    for m in ("vision", "touch"):
+        Image.fromarray(pack.images[m][7]).save(tmp_path / f"{m}.png")
+    (tmp_path / "pairs.csv").write_text("vision,gel\nvision.png,touch.png\n")
+    assert main([*command, str(tmp_path / "pairs.csv"), "--touch", "gel", "--out", str(tmp_path / "one.csv")]) == 0
+    one, row = pyarrow.csv.read_csv(tmp_path / "one.csv"), pyarrow.csv.read_csv(out).slice(7, 1)
+    assert one.column("pattern.rows").to_pylist() == pytest.approx(row.column("pattern.rows").to_pylist(), abs=1e-5)
     capsys.readouterr()
     wrong = {
         (): "give one SOURCE",
-        (str(pack.path), *both): "give one SOURCE",
+        (str(films["touch"]), *both): "give one SOURCE",
         (str(films["touch"]),): "takes vision and touch",
         tuple(both[2:]): "takes 1 vision stream",
         ("--vision", "0", *both[2:]): "give a video",

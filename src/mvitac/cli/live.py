@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,8 +19,10 @@ from tyro.conf import Positional
 from mvitac.cli.options import check_json, check_models, loading, parse
 from mvitac.data.images import decode
 from mvitac.data.pack import Pack
+from mvitac.datasets import dataset
+from mvitac.datasets.pack import PackConfig
 from mvitac.deploy.engine import EXPORT, Engine, about_sensor, frame_shapes
-from mvitac.live.cameras import recording, source
+from mvitac.live.cameras import is_recording, recording, source
 from mvitac.live.contact import LiveConfig
 from mvitac.live.predictor import Live
 from mvitac.live.recorder import Recorder
@@ -150,17 +152,17 @@ class _PredictOptions:
     """Predict from every frame of a recording, as fast as the model computes, into a table: frame number, time, contact,
     classes with probabilities, values with spread (docs/live.md).
 
-    A SOURCE is a video file, a folder of images[@FPS], or a pack.
+    A SOURCE is a video file, or a folder of images[@FPS].
     """
 
     model: Positional[str]
     """Folder of an export (fastest); or of a run or an artifact, or owner/name on the Hub, which is exported first."""
     source: Positional[str | None] = None
-    """SOURCE, where the model takes one input; or a pack."""
+    """SOURCE, where the model takes one input; or other data: a pack, a table, a bag, whatever --data reads."""
     vision: str | None = None
-    """SOURCE of the camera. Frames of several recordings are matched by time."""
+    """SOURCE of the camera. Frames of several recordings are matched by time. Of other data: the name of its images."""
     touch: tuple[str, ...] = ()
-    """SOURCE of the touch sensor, or of both of a gripper: left right."""
+    """SOURCE of the touch sensor, or of both of a gripper: left right. Of other data: the name of its images."""
     out: Path = Path("predictions.csv")
     """The table, a row for each frame."""
     background: tuple[Path, ...] = ()
@@ -173,29 +175,40 @@ class _PredictOptions:
 def predict(argv: list[str]) -> None:
     """mvitac predict MODEL SOURCE | [--vision SOURCE] [--touch SOURCE...] [--out FILE.csv]"""
     options = parse(_PredictOptions, argv, "predict")
-    if bool(options.source) == bool(options.vision or options.touch):
+    files = not options.source or is_recording(options.source)
+    if files and bool(options.source) == bool(options.vision or options.touch):
         raise ValueError("give one SOURCE, or those of --vision and --touch")
     check_place(options.out)
     free = [np.array(decode(file)) for file in options.background]
     given = {"vision": (options.vision,) if options.vision else (), "touch": options.touch}
-    engine = _engine(options.model, options.threads, tuple(m for m in given if given[m]))
+    engine = _engine(options.model, options.threads, tuple(m for m in given if given[m] and files))
     if not (engine.classes or engine.values):
         raise ValueError(f"{options.model} has no probes of classes or values: export it on data that has labels")
-    if options.source and (Path(options.source) / "pack.json").is_file():
-        pack = Pack(options.source)
+    if options.source and not files:
+        pack = _opened(options.source, given, next(iter(engine.inputs.values()))[0])
         _write(options.out, pack_tables(engine, pack), pack.num)
         return
     if options.source:
         if len(engine.inputs) > 1:
             raise ValueError("the model takes vision and touch: give --vision SOURCE, --touch SOURCE, or both")
         given = dict.fromkeys(engine.inputs, (options.source,))
-    files = {m: [recording(text) for text in texts] for m, texts in given.items() if texts}
-    recordings = Recordings(engine, files, options.live, free)
+    opened = {m: [recording(text) for text in texts] for m, texts in given.items() if texts}
+    recordings = Recordings(engine, opened, options.live, free)
     _write(options.out, recordings.tables(), recordings.num)
     if num := recordings.left_out:
         _say(f"{num} frames are left out: damaged, or without a frame of the other recording within {TOGETHER} s")
-    if "touch" in files and not recordings.calibrated:
+    if "touch" in opened and not recordings.calibrated:
         _say(f"contact is not known: no {options.live.calibration} frames without it, and no --background")
+
+
+def _opened(source: str, names: Mapping[str, Sequence[str]], side: int) -> Pack:
+    """Any data, every image of it, at ``side`` px; ``names`` are those of its images by modality, where it has names."""
+    config: Any = dataset(source)
+    if isinstance(config, PackConfig):
+        return config.open()
+    given: dict[str, Any] = {"vision": names["vision"][0] if names["vision"] else None, "touch": names["touch"] or None}
+    given |= {"every": 1} if hasattr(config, "every") else {}
+    return replace(config, size=side, **{name: value for name, value in given.items() if value}).open()
 
 
 def _write(out: Path, tables: Iterator[dict[str, Any]], num: int) -> None:

@@ -50,6 +50,10 @@ class RosbagConfig(RowsConfig):
         super().__post_init__()
         check_range(self, 1, math.inf, "every")
 
+    @classmethod
+    def reads(cls, path: Path) -> bool:
+        return path.suffix == ".bag" or (path / "metadata.yaml").is_file()
+
     def unused(self) -> tuple[str, ...]:
         return tuple(name for name in super().unused() if name not in ("tolerance", "interpolate"))
 

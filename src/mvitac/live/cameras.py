@@ -204,6 +204,14 @@ def source(text: str, modality: str) -> Source:
     return recording(text)
 
 
+def is_recording(text: str) -> bool:
+    """Whether ``text`` names a video, or a folder[@fps] with images in it."""
+    folder = text.rpartition("@")[0]
+    path = Path(folder) if folder and Path(folder).is_dir() else Path(text)
+    images = path.is_dir() and any(file.suffix.lower() in IMAGES for file in path.iterdir())
+    return images or path.suffix.lower() in VIDEOS
+
+
 def recording(text: str) -> Recording:
     """The video file or the folder[@fps] that ``text`` names; ValueError if there is none, or it cannot be read."""
     name, at, rate = text.rpartition("@")
