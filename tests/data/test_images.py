@@ -90,18 +90,6 @@ def test_same_pixels_everywhere(kind: str, tmp_path: Path) -> None:
         assert np.array_equal(fit(found, SIDE), packed)
 
 
-def test_floating_point_images_are_refused_by_name() -> None:
-    with pytest.raises(ValueError, match=r"touch: this image cannot be used .*floating-point"):
-        to_array(Image.fromarray(np.ones((8, 8), np.float32)), 3, "touch")
-
-
-def test_find_does_not_stack_sensors_of_two_sizes(tmp_path: Path) -> None:
-    Image.new("RGB", (8, 8)).save(tmp_path / "left.png")
-    Image.new("RGB", (8, 9)).save(tmp_path / "right.png")
-    with pytest.raises(ValueError, match=r"left.png is 8 x 8, .*right.png is 8 x 9: stacked sensors need one size"):
-        _picture([tmp_path / "left.png", tmp_path / "right.png"])
-
-
 def smooth(size: tuple[int, int]) -> Image.Image:
     """A random RGB picture that JPEG keeps well."""
     small = np.random.default_rng(5).integers(0, 256, (16, 16, 3), dtype=np.uint8)

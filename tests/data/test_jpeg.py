@@ -111,12 +111,6 @@ def test_indexed_like_the_array_it_stands_for(
     assert (len(images), images.shape, images.dtype, images.nbytes) == (120, whole.shape, whole.dtype, whole.nbytes)
 
 
-@pytest.mark.parametrize("row", [120, -121])
-def test_rows_that_are_not_there(small: Pack, row: int) -> None:
-    with pytest.raises(IndexError):
-        small.images["touch"][row]
-
-
 def test_two_sensors_keep_apart(tmp_path: Path) -> None:
     """At a side of whole blocks nothing of one sensor gets into the other; each is what it is alone."""
     source = Toy(num=24, touch_channels=6)

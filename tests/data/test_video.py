@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import random
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -160,11 +158,6 @@ def test_frames_come_as_they_are_decoded(made: dict[str, Path], count: dict[str,
     assert count["packets"] <= 2  # not a list of all in disguise
 
 
-def test_order_and_repetition_of_the_request_do_not_matter(made: dict[str, Path]) -> None:
-    assert [number for number, _ in frames(made["mpeg4"], (40, 3, 40, 17))] == [3, 17, 40]
-    assert list(frames(made["mpeg4"], ())) == []
-
-
 # -- damage -----------------------------------------------------------------------------------------------------------
 
 
@@ -259,11 +252,6 @@ def test_a_file_that_is_replaced_is_read_anew(tmp_path: Path) -> None:
     assert num_frames(path) == 10
     write_video(path, 25, lambda i: numbered(i, "touch"))
     assert num_frames(path) == 25
-
-
-def test_decoding_needs_no_torch() -> None:
-    code = "import sys, mvitac.data.video; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real recordings are not here")

@@ -78,24 +78,6 @@ def test_every_row_of_every_plan_is_a_run(name: str, recipe_name: str) -> None:
             assert found == (tuple(value) if isinstance(value, list) else value), (row.label, field)
 
 
-def test_the_plans_hold_the_papers_tables() -> None:
-    """Tables I and II as printed (tactile / tactile + visual)."""
-    printed = {row.label: row.printed for row in TABLE1.rows}
-    assert list(printed["MViTac"]["touch"].values()) == [57.6, 86.2, 82.1]
-    assert list(printed["MViTac"]["both"].values()) == [74.9, 91.8, 84.1]
-    assert list(printed["TAG (CMC)"]["touch"].values()) == [54.7, 77.3, 79.4]
-    assert list(printed["TAG (CMC)"]["both"].values()) == [68.6, 87.1, 82.4]
-    assert list(printed["SSVTP"]["touch"].values()) == [46.1, 79.7, 75.8]
-    assert list(printed["SSVTP"]["both"].values()) == [70.7, 88.6, 83.6]
-    assert list(printed["supervised, touch only"]["touch"].values()) == [57.4, 89.1, 79.3]
-    assert list(printed["supervised, both"]["both"].values()) == [48.0, 85.9, 80.0]
-    assert list(TABLE1.printed_majority.values()) == [18.6, 66.1, 56.3]
-    second = {row.label: row.printed["both"]["success"] for row in TABLE2.rows if row.printed}
-    assert second == {"TAG (CMC)": 56.3, "MViTac": 60.3, "Calandra et al., supervised": 73.1}
-    run = TABLE2.run(TABLE2.rows[3], PackConfig(), 0, phased=True)
-    assert run.augment.touch.grayscale == run.augment.vision.grayscale == 0
-
-
 def test_table1_has_one_budget(pack: Pack, tmp_path: Path) -> None:
     work = lay_out(small(pack, rows=TABLE1.rows), pack, tmp_path, ProbeConfig())
     assert set(work.left_out) == {"TAG (CMC), its own tau .07"} and len(work.jobs) == 32  # smoke changes no tau
@@ -156,26 +138,13 @@ def test_a_row_may_read_the_same_samples_in_another_way(pack: Pack, tmp_path: Pa
 
 
 def test_a_plan_from_a_file(tmp_path: Path) -> None:
-    text = """
-    seeds = 2
-    reference = "a"
-    set = { steps = 5 }
-    data = { name = "pack", path = "packs/x" }
-    [[rows]]
-    label = "a"
-    [[rows]]
-    label = "b"
-    method = "cmc"
-    set = { "method.num_negatives" = 9, "augment.touch.scale" = [0.3, 1.0] }
-    """
-    (tmp_path / "mine.toml").write_text(text)
-    plan = find_plan(str(tmp_path / "mine.toml"))
+    rows = [{"label": "a"}, {"label": "b", "method": "cmc", "set": {"augment.touch.scale": [0.3, 1.0]}}]
+    value = {"rows": rows, "reference": "a", "set": {"steps": 5}, "data": {"name": "pack", "path": "packs/x"}}
+    (tmp_path / "mine.json").write_text(json.dumps(value))
+    plan = find_plan(str(tmp_path / "mine.json"))
     assert plan.name == "mine" and plan.data == PackConfig(path=Path("packs/x"))
     run = plan.run(plan.rows[1], plan.data, 1, phased=False)
-    assert (run.steps, run.method.num_negatives, run.augment.touch.scale) == (5, 9, (0.3, 1.0))  # type: ignore
-    as_json = {"rows": [{"label": "a"}], "reference": "a"}
-    (tmp_path / "other.json").write_text(json.dumps(as_json))
-    assert find_plan(str(tmp_path / "other.json")).rows == (Row(label="a"),)
+    assert (run.steps, run.method.name, run.augment.touch.scale) == (5, "cmc", (0.3, 1.0))
 
 
 @pytest.mark.parametrize(
@@ -554,11 +523,6 @@ def test_a_control_of_one_probe_is_one_line_of_the_csv(done: tuple[Path, dict]) 
     probes = {name: {r["probe"] for r in rows if r["row"] == name} for name in {r["row"] for r in rows}}
     assert probes["pixels"] == probes["majority"] == probes["noise only"] == {"linear"}
     assert probes["MViTac"] == {"linear", "knn"} and probes["supervised, touch, end to end"] == {"own"}
-
-
-def test_a_row_is_not_named_as_a_control_of_the_data(pack: Pack, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="row 'noise only' has the name of a control of this data"):
-        lay_out(small(pack, rows=(*ROWS, Row(label="noise only"))), pack, tmp_path, ProbeConfig())
 
 
 # -- the command: killed and resumed, several at once -----------------------------------------------------------------

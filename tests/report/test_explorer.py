@@ -48,15 +48,6 @@ def test_at_most_ten_classes_are_coloured_first(land: ExplorerData, monkeypatch:
     assert value["coloured"] == [f"class {i}" for i in range(13) if i not in (0, 4, 12)]
 
 
-def test_the_axes_say_what_they_are(land: ExplorerData) -> None:
-    x = land.x["touch"] - land.x["touch"].mean(0)
-    shares = np.linalg.svd(x, compute_uv=False) ** 2
-    shares = 100 * shares / shares.sum()
-    assert json.loads(land.points("touch", "split", "all", None))["axes"] == [
-        f"principal component {i + 1} of touch ({shares[i]:.0f} % of the variance)" for i in (0, 1)
-    ]
-
-
 def test_the_plane_holds_the_most_variance(land: ExplorerData) -> None:
     x = land.x["touch"] - land.x["touch"].mean(0)
     first, second = land.plane("touch").T
@@ -88,13 +79,6 @@ def test_a_pack_of_other_numbers_or_tasks(land: ExplorerData, artifact: Path, pa
     wrong = land.shown("all", "pattern", mistakes=True)
     assert np.array_equal(found.shown("all", "pattern", mistakes=True), wrong)
     assert found.describe(int(wrong[0])).partition(" · light")[0] in land.describe(int(wrong[0]))
-
-
-def test_fewer_rows_are_of_every_class(artifact: Path, pack: Pack) -> None:
-    """Although the pack's three classes take turns, and every third row would be of one."""
-    few = ExplorerData(mvitac.load(artifact), pack, limit=40)
-    assert len(few.rows) == 40 and (np.diff(few.rows) > 0).all()
-    assert np.bincount(few.labels["pattern"]).min() >= 8
 
 
 def test_a_run_that_is_not_finished_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,6 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
@@ -186,12 +184,6 @@ def test_tables_of_a_comparison_have_a_table_of_targets(scored: tuple[Path, Pack
     assert {r["probe"] for r in rows if r["row"] == "pixels"} == {"linear"}
 
 
-def test_a_comparison_of_classes_has_the_columns_it_had(scored: tuple[Path, Pack, dict[str, Any]]) -> None:
-    classes = [r for r in scored[2]["records"] if "targets" not in r]
-    head = table_formats.comma(compared({**scored[2], "records": classes})).splitlines()[0]
-    assert head.endswith(",p,leak")
-
-
 def test_figures_cut_off_what_no_axis_can_show() -> None:
     cells = {"good": {"mean": 0.8, "low": 0.7, "high": 0.9}, "bad": {"mean": -40.0, "low": -90.0, "high": -3.0}}
     unknown = {"mean": 0.2, "low": None, "high": 1.0}
@@ -211,24 +203,6 @@ def test_predictions_that_are_exact_lie_on_the_line() -> None:
     at = axes.collections[0].get_offsets()
     assert at[:2].tolist() == [[0, 0], [2, 2]] and at[2, 1] == axes.get_ylim()[1]  # far off: at the edge
     assert axes.get_xlabel() == "true, N"
-
-
-def test_packs_list_their_values(
-    scored: tuple[Path, Pack, dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    _, pack, _ = scored
-    weight = pack.column("weight")[pack.rows("test")]
-    low, high = np.nanmin(weight), np.nanmax(weight)
-    assert main(["data", "info", str(pack.path), "--json", str(tmp_path / "info.json")]) == 0
-    found = json.loads((tmp_path / "info.json").read_text())["splits"]["test"]["values"][-1]
-    assert found == {
-        "task": "both",
-        "target": "weight",
-        "unit": "N",
-        "rows": int(np.isfinite(weight).sum()),
-        "low": low,
-        "high": high,
-    }
 
 
 def test_a_target_without_values_in_test_is_named(tmp_path: Path) -> None:

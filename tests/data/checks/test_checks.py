@@ -19,7 +19,7 @@ from mvitac.data.build import build
 from mvitac.data.checks.examine import examine, examine_pack, examine_source
 from mvitac.data.checks.finding import Finding, exit_code
 from mvitac.data.checks.image_checks import MAX_LAG, motion_correlations
-from mvitac.data.checks.image_stats import area_means, look_at
+from mvitac.data.checks.image_stats import look_at
 from mvitac.data.checks.name_checks import similar_names
 from mvitac.data.pack import Pack
 from mvitac.data.source import Count, Sample, Source
@@ -252,21 +252,6 @@ def test_a_source_is_examined_as_it_came(tmp_path: Path) -> None:
     assert [heading[:18] for heading, _ in blocks] == ["No suspicious rows"]
 
 
-def test_images_that_a_reader_shrinks_keep_their_size(tmp_path: Path) -> None:
-    """Readers of files hand over images as the pack will store them: the sizes told are those on the disk."""
-    rng = np.random.default_rng(0)
-    rows = ["touch,label,group"]
-    for i in range(16):
-        size = (48, 64, 3) if i < 4 else (24, 32, 3)
-        Image.fromarray(rng.integers(0, 256, size, np.uint8)).save(tmp_path / f"{i}.png")
-        rows.append(f"{i}.png,{'ab'[i % 2]},g{i // 2}")
-    (tmp_path / "m.csv").write_text("\n".join(rows))
-    source = FolderConfig(path=tmp_path / "m.csv", labels=("label",), size=40).source()
-    findings = examine_source(source, size=SIDE, quiet=True)
-    found = {f.item: f for f in findings}["sensors and resolutions"]
-    assert found.verdict == "look" and "touch_size: 32 x 24 75 %, 64 x 48 25 %" in found.evidence
-
-
 def test_a_part_of_a_source_proves_no_class_unseen(tmp_path: Path) -> None:
     rows = ["touch,label,object,split"]
     for i in range(60):
@@ -342,13 +327,6 @@ def test_the_command_on_a_source(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 
 # -- the parts ----------------------------------------------------------------------------------------------------------
-
-
-def test_area_means_count_every_pixel_once() -> None:
-    image = np.random.default_rng(0).integers(0, 256, (2, 12, 12, 3), np.uint8)
-    expected = image.reshape(2, 4, 3, 4, 3, 3).mean(axis=(2, 4)).round()
-    assert np.abs(area_means(image, 4) - expected).max() <= 1
-    assert area_means(np.full((1, 13, 17, 3), 200, np.uint8), 5).tolist() == np.full((1, 5, 5, 3), 200).tolist()
 
 
 @pytest.mark.parametrize("late", [-3, 0, 2])

@@ -159,11 +159,6 @@ def test_the_command_checks_windows_when_asked(
     assert "longer than every touch" in capsys.readouterr().out
 
 
-def test_a_value_that_is_missing_is_no_broken_number(tmp_path: Path) -> None:
-    found = {finding.item: finding for finding in examine(packed(tmp_path / "pack", "missing"))}
-    assert found["numbers"].verdict == "ok"
-
-
 def test_a_stretch_of_zeros_is_no_contact(healthy: Pack) -> None:
     pack = Pack(healthy.path)
     force = pack.column("force_n")
