@@ -4,7 +4,6 @@ Shapes: features [N, D] of the rows shown; L2-normalised embeddings in the space
 """
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +22,6 @@ from mvitac.report.html import picture
 from mvitac.report.sections import Study
 
 NUM_MAP, NUM_QUERIES, NUM_FOUND = 1500, 8, 5
-NUM_RANGES = 5  # of values, in the map
 
 
 class Query(NamedTuple):
@@ -76,7 +74,8 @@ def feature_maps(study: Study) -> list[Markup]:
     rows = sample(rows, NUM_MAP)
     if len(rows) < 8:
         return []
-    labels, names, by = _labels(study, rows)
+    first = next(iter(study.pack.spec.tasks), None)
+    labels, names, by = study.labels(rows), first.classes if first else (), f" by {first.name}" if first else ""
     drawn = []
     for modality in study.pack.spec.modalities:
         points = embed_2d(features(study.runs[0].model, study.pack, modality, rows))
@@ -88,19 +87,6 @@ def feature_maps(study: Study) -> list[Markup]:
         " Near points are similar; distances between far clusters mean nothing."
     )
     return [html.paragraph(intro), html.grid(drawn, "grid large")]
-
-
-def _labels(study: Study, rows: np.ndarray) -> tuple[np.ndarray, Sequence[str], str]:
-    """Labels of ``rows`` (-1 = none), their names, and what they are of: the first task, or ranges of the first value."""
-    spec = study.pack.spec
-    if spec.tasks:
-        return study.labels(rows), spec.tasks[0].classes, f" by {spec.tasks[0].name}"
-    if not spec.values or np.isnan(values := study.pack.values(spec.values[0])[rows, 0]).all():
-        return np.full(len(rows), -1), (), ""
-    target, edges = spec.values[0].targets[0], np.nanquantile(values, np.linspace(0, 1, NUM_RANGES + 1))
-    ranges = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, NUM_RANGES - 1)
-    names = [f"{low:.3g} to {high:.3g} {target.unit}" for low, high in pairwise(edges)]
-    return np.where(np.isnan(values), -1, ranges), names, f" by {target.name}"
 
 
 _SHOWN = {
