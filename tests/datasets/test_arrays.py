@@ -293,6 +293,7 @@ def test_a_crop_is_cut_out_of_images_and_backgrounds(tmp_path: Path) -> None:
     pack = packed(FolderConfig(**options, crop=crops), tmp_path / "p")
     assert (pack.images["touch"][..., 0] == 10 * np.arange(12)[:, None, None]).all()
     assert (pack.images["touch"][..., 3] == 100 + 10 * np.arange(12)[:, None, None]).all()
+    assert pack.spec.notes[0] == "left=0:4:20:16 is the part of the images that is used, squeezed to a square"
     flat = packed(FolderConfig(**options, crop=crops, difference=True, background=("a", "b")), tmp_path / "d")
     assert (flat.images["touch"] == 128 + 5 * np.arange(12)[:, None, None, None]).all()
     with pytest.raises(ValueError, match=r"0\.png is 40 x 20: crop 21:4:20:16 is larger"):

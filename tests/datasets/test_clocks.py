@@ -115,6 +115,7 @@ def test_two_cameras_out_of_step_are_paired_by_time(tmp_path: Path) -> None:
     for k in range(3):
         film(tmp_path / f"set/{k}/gel.mp4", 50, which=k, rate=25)
         film(tmp_path / f"set/{k}/camera.mp4", 18, which=k + 1, rate=10)
+    film(tmp_path / "set/0/wrist.mp4", 5)  # not asked for
     names: dict[str, Any] = {"touch": ("gel",), "vision": "camera", "every": 2}
     pack = packed(tmp_path / "set", tmp_path / "p", tolerance=0.05, **names)
     time, which = pack.column("time").astype(float), pack.column("recording")

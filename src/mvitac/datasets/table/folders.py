@@ -94,16 +94,18 @@ def list_videos(path: Path, names: Sequence[str], plain: str, every: int | None,
     Args:
         path: A video, or a folder.
         names: Names of cameras besides ``CAMERAS``, the most important first.
-        plain: Modality of a video without such a name.
+        plain: Modality of a video without such a name, if no ``names`` are given.
         every: Every how many frames are used.
         tolerance: Largest distance in seconds between frames of two cameras; rows with a larger one are left out.
     """
-    names = tuple(dict.fromkeys((*names, *CAMERAS)))
+    plain, names = "" if names else plain, tuple(dict.fromkeys((*names, *CAMERAS)))
     recordings: dict[str, dict[str, Path]] = {}
     for video in sorted(path.rglob("*")) if path.is_dir() else [path]:
         if video.suffix.lower() in VIDEOS:
             parts = [*video.relative_to(path).parts[:-1], video.stem] if path.is_dir() else [video.stem]
             camera = next((name for name in names if name in parts), plain)
+            if not camera:
+                continue  # a camera that is not asked for
             recording = "/".join(part for part in parts if part != camera) or path.resolve().stem
             known = recordings.setdefault(recording, {}).setdefault(camera, video)
             if known != video:

@@ -247,8 +247,8 @@ class Rows(Source):
         )
 
     def _scaled(self, table: Manifest) -> tuple[str, ...]:
-        """Say how numbers of more than 8 bits become gray levels, judged by the first image of each column."""
-        notes = []
+        """Say what is cropped, and how more than 8 bits become gray levels, judged by the first image of each column."""
+        notes = [f"{text} is the part of the images that is used, squeezed to a square" for text in self._config.crop]
         for column in self._images:
             ref = next((ref for ref in table.images[column] if ref), None)
             if ref and is_deep(ref):
