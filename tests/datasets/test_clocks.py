@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import copy
 import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from PIL import Image
 
 from mvitac.data.build import build
 from mvitac.data.checks.examine import examine_source
+from mvitac.data.checks.image_stats import look_at
+from mvitac.data.checks.value_checks import time_shift
 from mvitac.data.pack import Pack
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.table.clocks import seconds
 from support.videos import film, shade, write_video
 
+REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "wedge_force" / "manifest.csv"
 START = 1_700_000_000.0
 
 
@@ -237,3 +242,27 @@ def test_the_check_finds_a_shift_and_its_size(tmp_path: Path, num: int, seconds:
             told = re.search(r"values come [\d.]+ rows \(([\d.]+) s\) (late|early)", found.evidence)
             assert told and told[2] == ("late" if shift > 0 else "early")
             assert abs(float(told[1]) - 0.5) <= max(0.04, every / 50 + 0.001), found
+
+
+@pytest.mark.skipif(not REAL.is_file(), reason="wedge_force is not beside the project")
+def test_the_check_finds_shifts_of_real_grasps(tmp_path: Path) -> None:
+    """33 grasps of a GelSight Wedge at 30 Hz with force: as recorded, shifted alike, and each by its own shift."""
+    pack = packed(REAL, tmp_path / "p", vision="", values=("force_n:N",), group="object", touch_group="recording")
+    looks, time, force = look_at(pack), pack.column("time").astype(float), pack.values(pack.spec.values[0])[:, 0]
+    rng, place = np.random.default_rng(0), pack.table.schema.get_field_index("force_n")
+    told = {}
+    for shift in (0.0, 0.03, -0.2, 0.5, -0.5, 1.0, "own"):
+        late = np.full(pack.num, np.nan)
+        for number in range(33):
+            rows = pack.rows_of(number)
+            by = rng.uniform(-0.5, 0.5) if shift == "own" else float(shift)
+            late[rows] = np.interp(time[rows] - by, time[rows], force[rows], np.nan, np.nan)
+        moved = copy.copy(pack)
+        moved.__dict__.pop("_answers", None)  # kept values
+        moved.table = pack.table.set_column(place, "force_n", pa.array(late))
+        found = time_shift(moved, looks)
+        size = re.search(r"values come ([\d.]+) rows .* (late|early)", found.evidence)
+        told[shift] = found.verdict, size and (1 if size[2] == "late" else -1) * float(size[1])
+        print(shift, found.evidence)
+    assert [verdict for verdict, _ in told.values()] == ["ok", "ok", "look", "look", "look", "look", "look"]
+    assert all(abs(told[shift][1] - 30 * shift) <= 1 for shift in (-0.2, 0.5, -0.5, 1.0)), told

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+from tyro.conf import Fixed
+
 from mvitac.data.video import num_frames, spread
 from mvitac.datasets.table.manifest import Manifest, in_clone
 from mvitac.datasets.table.table import RowsConfig
@@ -37,9 +39,9 @@ class PhysiclearConfig(RowsConfig):
 
     path: Path = Path("octopi")
     """Folder of the clone."""
-    frames: int = 8
+    frames: Fixed[int] = 8
     """Number of frames per video."""
-    span: tuple[float, float] = (0.3, 0.6)
+    span: Fixed[tuple[float, float]] = (0.3, 0.6)
     """Part of each video to take frames from, as fractions of its length: videos begin and end without contact."""
     title: str | None = "physiclear"
     labels: tuple[str, ...] = tuple(LABELS)

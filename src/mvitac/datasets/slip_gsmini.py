@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+from tyro.conf import Fixed
+
 from mvitac.data.video import num_frames, spread
 from mvitac.datasets.table.manifest import Manifest, in_clone
 from mvitac.datasets.table.splits import add_folds
@@ -33,7 +35,7 @@ class SlipGSMiniConfig(RowsConfig):
 
     path: Path = Path("Incipient-Slip-Detection")
     """Folder of the clone."""
-    frames: int = 12
+    frames: Fixed[int] = 12
     """Number of frames per recording, evenly spaced from the first to the last."""
     title: str | None = "slip_gsmini"
     labels: tuple[str, ...] = ("slip",)

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from tyro.conf import Fixed
 
 from mvitac.data.source import Count, Sample, Source, one_stamp, stamp_of
 from mvitac.data.spec import PHASES, DataSpec, Task
@@ -74,11 +75,11 @@ class CalandraConfig(DatasetConfig):
     outcome. authors: success_trained_with_after, their protocol (train on all phases, choose and test on 'during')."""
     phases: tuple[Phase, ...] = PHASES
     """Phases that become rows. All of them are used for pre-training."""
-    kinect_crop: bool = False
+    kinect_crop: Fixed[bool] = False
     """Crop the camera image to the table, as the owners do."""
-    extra_objects: bool = False
+    extra_objects: Fixed[bool] = False
     """Keep the objects outside the authors' 40 as unlabelled rows for pre-training (split authors)."""
-    repairs: tuple[str, ...] = ()
+    repairs: Fixed[tuple[str, ...]] = ()
     """Additional object names to repair, as "wrong=right"."""
 
     def __post_init__(self) -> None:

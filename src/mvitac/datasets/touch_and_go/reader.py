@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+from tyro.conf import Fixed
+
 from mvitac.data.source import Count, Lost, Sample, Source, one_stamp
 from mvitac.data.spec import MODALITIES, DataSpec, Task
 from mvitac.datasets.base import KEEPING, DatasetConfig
@@ -52,7 +54,7 @@ class TouchAndGoConfig(DatasetConfig):
     the paper; 100 of their 106 test recordings are also in train, which results note."""
     modalities: Literal["both", "vision", "touch"] = "both"
     """Which images to pack, e.g. touch if only the GelSight videos were downloaded."""
-    frames: Literal["auto", "video", "jpeg"] = "auto"
+    frames: Fixed[Literal["auto", "video", "jpeg"]] = "auto"
     """video: read the mp4 files. jpeg: read the extracted folders. auto: the mp4 if it exists."""
     partial: bool = False
     """Pack the available recordings and list the missing ones, instead of stopping."""
