@@ -34,7 +34,7 @@ class PackConfig(DatasetConfig):
             if not len(pack.rows("val")):
                 raise ValueError(f"{self.path} has no split val to score on: leave out --data.score-on")
             others = {"test": "hidden", "val": "test"}
-            splits = {name: [others.get(s, s) for s in pack.column(name)] for name in pack.spec.split_columns}
+            splits = {name: [others.get(str(s), str(s)) for s in pack.column(name)] for name in pack.spec.split_columns}
             pack = pack.with_splits(splits)
             pack.spec = replace(pack.spec, notes=(*pack.spec.notes, ON_VAL))
         return pack

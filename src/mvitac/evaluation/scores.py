@@ -5,7 +5,7 @@ A record is one probe of one source on one task. ``score`` counts correct rows p
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -147,7 +147,7 @@ def is_uneven(record: dict[str, Any]) -> bool:
     return bool(rows.max() > 1.25 * rows[rows > 0].mean())
 
 
-def per_class(records: Sequence[dict[str, Any]], classes: dict[str, Sequence[str]], probe: str) -> dict[str, Any]:
+def per_class(records: Sequence[dict[str, Any]], classes: Mapping[str, Sequence[str]], probe: str) -> dict[str, Any]:
     """Precision and recall of each class as task -> modality -> a list of ``classes``; over seeds, from the summed counts.
 
     Each has its name, "rows" and "groups" of test, and "scores": source -> [precision, recall]. Precision is None where a

@@ -197,7 +197,7 @@ class _Job:
     def forecast(self, step: int = 0, values: dict[str, float] | None = None) -> None:
         """Say how many steps there will be, and as a logger of the first training how long they take."""
         tried = len(self.asked.lr) * (len(self.asked.lr) > 1 or len(self.asked.steps) > 1)
-        each = [*[self.asked.steps[0]] * tried, *self.asked.steps[1:], *[max(self.asked.steps)] * self.asked.seeds]
+        each = [*self.asked.steps[:1] * tried, *self.asked.steps[1:], *[max(self.asked.steps)] * self.asked.seeds]
         num = len(self.kinds) * len(self.asked.fractions)
         steps = num * sum(each)
         if values is None:

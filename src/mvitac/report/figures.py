@@ -181,10 +181,10 @@ def confusion(title: str, counts: np.ndarray, classes: Sequence[str]) -> Figure:
     axes.set_aspect("equal")
     axes.spines[["left", "bottom"]].set_visible(False)
     if num <= 40:
-        size = 9 if num <= 8 else 7.5 if num <= 24 else 5
+        letters = 9 if num <= 8 else 7.5 if num <= 24 else 5
         names = [shorten(name, 14) for name in classes]
-        axes.set_xticks(range(num), names, rotation=0 if num <= 4 else 90, fontsize=size)
-        axes.set_yticks(range(num), names, fontsize=size)
+        axes.set_xticks(range(num), names, rotation=0 if num <= 4 else 90, fontsize=letters)
+        axes.set_yticks(range(num), names, fontsize=letters)
     else:
         axes.set_xticks([])
         axes.set_yticks([])
@@ -264,5 +264,5 @@ def to_png(figure: Figure, dpi: int = 200) -> bytes:
 
 def to_svg(figure: Figure) -> str:
     """The figure as the address of an image for HTML."""
-    metadata = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    metadata: dict[str, Any] = dict.fromkeys(("Creator", "Date", "Format", "Type"))
     return data_uri(_print(figure, "svg", metadata, facecolor="none"), "svg+xml")

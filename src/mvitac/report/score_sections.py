@@ -172,8 +172,8 @@ def values(study: Study) -> list[Markup]:
             looks = [(own_hue, figures.DASHES[i % len(figures.DASHES)]) for i, own_hue in enumerate(hues)]
             found_by = {study.sources[0]: mine, **beside}.items()
             lines = [figures.Line(s, *_errors(each, t), *look) for (s, each), look in zip(found_by, looks, strict=True)]
-            labels = {"x": f"true, {unit}", "y": f"mean absolute error, {unit}"}
-            drawing = figures.curves(f"{name}: error by range", lines, **labels)
+            x, y = f"true, {unit}", f"mean absolute error, {unit}"
+            drawing = figures.curves(f"{name}: error by range", lines, x=x, y=y)
             alt = f"Mean absolute error of {name} by range of the true value"
             drawn.append(study.figure(f"error {name}", drawing, alt, "Ranges hold equally many test rows."))
     if not drawn:

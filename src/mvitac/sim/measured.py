@@ -85,4 +85,4 @@ def read(calibration: str) -> Gel:
 @cache
 def _smooth(gel: Gel, width: int) -> F:
     """The gel at rest, averaged over squares of ``width`` pixels."""
-    return uniform_filter(gel.rest, (width, width, 1), mode="nearest") if width > 1 else gel.rest
+    return uniform_filter(gel.rest, width, mode="nearest", axes=(0, 1)) if width > 1 else gel.rest

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,7 +68,9 @@ def folder_stamp(path: str) -> Stamp:
     return sum(size for size, _ in found), max((time for _, time in found), default=0)
 
 
-def check_present(table: Manifest, by_modality: dict[str, Sequence[str]], allow_missing: bool) -> dict[str, list[bool]]:
+def check_present(
+    table: Manifest, by_modality: Mapping[str, Sequence[str]], allow_missing: bool
+) -> dict[str, list[bool]]:
     """Return, for each modality that some rows lack, which rows lack it; ValueError unless ``allow_missing``."""
     missing: dict[str, list[bool]] = {}
     for modality, columns in by_modality.items():

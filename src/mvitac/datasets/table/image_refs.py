@@ -177,7 +177,7 @@ def open_arrays(path: str | Path) -> Iterator[Any]:
             with h5py.File(path, rdcc_nbytes=CHUNK_BYTES) as file:
                 yield file
         else:
-            import zarr
+            import zarr.storage
 
             zipped = str(path).lower().endswith(".zip")
             yield zarr.open_group(zarr.storage.ZipStore(path, mode="r") if zipped else str(path), mode="r")
