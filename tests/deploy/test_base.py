@@ -10,6 +10,7 @@ import mvitac
 from mvitac.evaluation.leaks import read_sources
 from mvitac.shipped import BASE, named, with_names
 from mvitac.training.start import read_start
+from support.toy import toy_pack
 
 
 def test_base_answers_offline_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -31,3 +32,9 @@ def test_commands_know_base(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     run = replace(mvitac.recipe("locked"), init=mvitac.Init(path=Path("base")))
     start = read_start(run.init)
     assert start is not None and set(start.trunks) == {"vision", "touch"}
+
+
+def test_a_probe_of_base_writes_nothing_into_the_package(tmp_path: Path) -> None:
+    before = sorted(BASE.iterdir())
+    found = mvitac.probe("base", on=toy_pack(tmp_path / "p"), tasks=("bright",), modalities=("touch",), controls=False)
+    assert found["summary"]["bright"]["touch"]["mvitac"]["mean"] > 0.5 and sorted(BASE.iterdir()) == before

@@ -30,7 +30,7 @@ from mvitac.model_files import Which, load, weights_file
 from mvitac.nn.encoders import build_trunk
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run, load_run
-from mvitac.shipped import named
+from mvitac.shipped import BASE, named
 from mvitac.system.files import check_place, digest_file, read_json, write_json
 from mvitac.system.progress import work
 from mvitac.system.threads import in_threads
@@ -107,8 +107,10 @@ def probe_runs(
     names = [name + ", best" * (weights == "best") for name in names_of(paths, models)]
     pack = _common_pack(models, pack)
     tasks, modalities = chosen(pack, session)
-    for path, model in zip(paths, models, strict=True):
+    kept = [path for path in paths if path != BASE]  # nothing is written into the package
+    for path in kept:
         check_place(path / "probe.json")
+    for path, model in zip(paths, models, strict=True):
         check_channels(path, model, pack, pack.spec.modalities)
     # The initial weights that an artifact names may be any file or download.
     runs = [m.run.fresh() if m.foreign else m.run for m in models]
@@ -133,7 +135,7 @@ def probe_runs(
     new = dict.fromkeys(about_new(model, pack, session.standardise) for model in models)
     if said := [*filter(None, new), *describe_statistics(pack, session.standardise)]:
         result["statistics"] = said
-    for path in paths:
+    for path in kept:
         name = "probe" + ".best" * (weights == "best") + ".folds" * bool(session.folds)
         write_json(path / f"{name}.json", result, sealed=True)
     return Scores(result)

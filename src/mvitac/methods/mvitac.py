@@ -214,7 +214,8 @@ class MViTac(Contrastive):
 def embed(name: str, towers: nn.ModuleDict, batch: Views, views: slice) -> Embeddings:
     """Embeddings of ``views`` of each modality by both heads, keyed ``(name, modality, view, head)``.
 
-    On a CPU the two towers run side by side, except with dropout, which needs one order of random numbers.
+    On a CPU the two towers run side by side, except with dropout, which needs one order of random numbers, and where the
+    features of a locked one are given: the other then has all threads.
     """
 
     def of(modality: str) -> Embeddings:
@@ -224,6 +225,7 @@ def embed(name: str, towers: nn.ModuleDict, batch: Views, views: slice) -> Embed
         return z
 
     branches = [partial(of, modality) for modality, _ in present(towers, batch)]
-    if batch.rows.device.type != "cpu" or draws_random_numbers(towers):
+    given = any(images[0].ndim == 2 for images in batch.images.values())
+    if batch.rows.device.type != "cpu" or draws_random_numbers(towers) or given:
         return {key: tensor for branch in branches for key, tensor in branch().items()}
     return in_branches(branches)
