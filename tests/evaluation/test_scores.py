@@ -112,13 +112,13 @@ def test_the_verdict_names_what_a_method_is_not_above() -> None:
     }
     assert score_text.verdicts(task) == [
         "mvitac by touch + vision: interval below imagenet and overlaps untrained",
-        "mvitac does not beat a frozen ImageNet trunk, by touch + vision",
+        "mvitac: not above a frozen ImageNet trunk beyond the intervals, by touch + vision",
     ]
     task["both"] = {"mvitac": cell(0.5, 0.6), "cmc": cell(None, 0.6), "imagenet": cell(0.1, 0.4)}
     assert score_text.verdicts(task) == [
         "mvitac by touch + vision: interval above every control",
         "cmc by touch + vision: interval overlaps imagenet, majority",
-        "cmc does not beat a frozen ImageNet trunk, by touch + vision",
+        "cmc: not above a frozen ImageNet trunk beyond the intervals, by touch + vision",
     ]
     assert score_text.verdicts({"touch": {"mvitac": cell(0.5, 0.6)}}) == []  # --no-controls
 

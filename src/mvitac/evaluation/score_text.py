@@ -136,7 +136,7 @@ def verdicts(task: dict[str, Any]) -> list[str]:
         cells = {WORDS[m]: (task[m][source], task[m].get("imagenet")) for m in columns_of(task) if source in task[m]}
         level = [m for m, (mine, frozen) in cells.items() if frozen and _low(mine) <= frozen["high"]]
         if level:
-            said.append(f"{source} does not beat a frozen ImageNet trunk, by {', '.join(level)}")
+            said.append(f"{source}: not above a frozen ImageNet trunk beyond the intervals, by {', '.join(level)}")
     return said
 
 

@@ -15,7 +15,7 @@ from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import scorable
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.run_names import names_of
-from mvitac.evaluation.score_text import WORDS, above, covered, headline, percent, score_name, verdicts, with_interval
+from mvitac.evaluation.score_text import WORDS, above, covered, headline, percent, score_name, with_interval
 from mvitac.model_files import load
 from mvitac.registry import to_json
 from mvitac.report import galleries, score_sections, tables
@@ -131,8 +131,6 @@ def _head(study: Study, title: str) -> Markup:
     }
     text = "; ".join(clauses(study)) or "nothing is scored on this data"
     text = f"{text[0].upper()}{text[1:]}."
-    for task, found in study.result["summary"].items():
-        text += "".join(f" On {task} {line}." for line in verdicts(found) if "ImageNet" in line)
     tiles = [_tile(study, task) for task in study.result["summary"]]
     return page.head(title, "Pre-training report", chips, text, tiles)
 
