@@ -107,9 +107,6 @@ def probe_runs(
     names = [name + ", best" * (weights == "best") for name in names_of(paths, models)]
     pack = _common_pack(models, pack)
     tasks, modalities = chosen(pack, session)
-    kept = [path for path in paths if path != BASE]  # nothing is written into the package
-    for path in kept:
-        check_place(path / "probe.json")
     for path, model in zip(paths, models, strict=True):
         check_channels(path, model, pack, pack.spec.modalities)
     # The initial weights that an artifact names may be any file or download.
@@ -135,7 +132,7 @@ def probe_runs(
     new = dict.fromkeys(about_new(model, pack, session.standardise) for model in models)
     if said := [*filter(None, new), *describe_statistics(pack, session.standardise)]:
         result["statistics"] = said
-    for path in kept:
+    for path in (path for path in paths if path != BASE):  # nothing is written into the package
         name = "probe" + ".best" * (weights == "best") + ".folds" * bool(session.folds)
         write_json(path / f"{name}.json", result, sealed=True)
     return Scores(result)
@@ -149,6 +146,8 @@ def _check_paths(paths: Sequence[Path], encoders: Sequence[str]) -> None:
             raise ValueError(f"{path} is a file: give the run's folder, where the scores are also written")
         if [p.resolve() for p in paths].count(path.resolve()) > 1:
             raise ValueError(f"run {path} is given twice: it would count as two seeds, give it once")
+        if path != BASE:
+            check_place(path / "probe.json")
 
 
 def _check_before(

@@ -88,11 +88,8 @@ def train(
 
 def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], validate: bool) -> None:
     run, pack, world, method, step = setup.run, setup.pack, setup.world, setup.method, setup.step
-    start, num_steps, steps_per_epoch = (
-        setup.start,
-        run.num_steps(len(setup.rows)),
-        run.steps_per_epoch(len(setup.rows)),
-    )
+    start, rows = setup.start, len(setup.rows)
+    num_steps, steps_per_epoch = run.num_steps(rows), run.steps_per_epoch(rows)
     save_every = run.checkpoint_every or max(MIN_BETWEEN_CHECKPOINTS, num_steps // 10)
     batches = setup.views.each(Batches(run, pack, setup.rows), start, num_steps)
 
