@@ -61,10 +61,10 @@ def test_the_card_names_what_encoders_and_what_probes_learned_from(artifact: Pat
     assert written.startswith("---\nlibrary_name: mvitac") and "columns, rows, checks" in written
     assert "| majority |" in written
     assert "Encoders and probes: toy; source: tests/support/toy.py; licence: none." in card(model, manifest)
-    assert "pre-trained without labels" in card(model, manifest)
+    assert "pre-trained without labels" in " ".join(card(model, manifest).split())
     manifest["data"] = {"name": "other", "licence": "CC-BY", "source": "others"}
     model.tasks = ("pattern",)  # as a supervised method leaves behind
-    text = card(model, manifest)
+    text = " ".join(card(model, manifest).split())
     assert "# mvitac on toy" in text and "with linear probes on other." in text
     assert "Encoders: toy; source: tests/support/toy.py; licence: none." in text
     assert "Probes: other; source: others; licence: CC-BY." in text

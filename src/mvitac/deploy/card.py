@@ -1,6 +1,7 @@
 """The model card of an artifact: what the model is, an example, scores next to controls, preprocessing, data."""
 
 import json
+import textwrap
 from typing import Any
 
 import jinja2
@@ -26,7 +27,7 @@ def card(model: Model, about: dict[str, Any]) -> str:
         keep_trailing_newline=True,
     )
     with fields_of("run.json"):
-        return pages.get_template("card.md.j2").render(
+        text = pages.get_template("card.md.j2").render(
             model=model,
             run=model.run,
             learned=learned,
@@ -42,6 +43,12 @@ def card(model: Model, about: dict[str, Any]) -> str:
             start=about["start"],
             listed=listed,
         )
+    as_it_is = ("|", "license")  # tables and the front matter
+    return "\n".join(line if line.startswith(as_it_is) else _wrapped(line) for line in text.split("\n"))
+
+
+def _wrapped(line: str) -> str:
+    return line if len(line) <= 120 else textwrap.fill(line, 120, break_long_words=False, break_on_hyphens=False)
 
 
 def _harmless(value: object) -> str:
