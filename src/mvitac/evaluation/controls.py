@@ -36,9 +36,7 @@ from mvitac.system.threads import in_threads
 CONTROLS = ("imagenet", "start", "untrained", "pixels", "border", "majority", "mean")
 """Names of the controls in the order of a table. The dataset's own controls come before the last two, of which a task has
 one: the most common class, or the mean value."""
-IMAGENET_SIDE = (
-    128  # px: the control sees images of this side, enlarged if need be, though the runs may see smaller ones
-)
+IMAGENET_SIDE = 128  # px: the control sees images of at least this side, enlarged if need be
 Records = list[dict[str, Any]]
 
 

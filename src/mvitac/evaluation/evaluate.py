@@ -16,7 +16,7 @@ from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.controls import Records, controls_of, frozen_trunks
 from mvitac.evaluation.encoders import Bound, open_encoders, probe_encoders
-from mvitac.evaluation.folds import fold_splits, with_split
+from mvitac.evaluation.folds import fold_splits
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
 from mvitac.evaluation.probe import PROBES, probe_model, probes_of, seen_by, split_rows
 from mvitac.evaluation.probe_config import ProbeConfig
@@ -196,8 +196,9 @@ def _in_folds(
     for k in range(num):
         folds.append([])
         for task, split in splits:
-            own = [(model, with_split(data, task, split[k])) for model, data in others]
-            folds[k] += score(with_split(pack, task, split[k]), own, [task])[0]
+            cells = {task.split: split[k].tolist()}
+            own = [(model, data.with_splits(cells)) for model, data in others]
+            folds[k] += score(pack.with_splits(cells), own, [task])[0]
     return pool(folds)
 
 

@@ -3,11 +3,9 @@
 Groups that a run learned from, also without their labels, are always fitted on and never tested.
 """
 
-import copy
 from collections.abc import Sequence
 
 import numpy as np
-import pyarrow as pa
 from sklearn.model_selection import StratifiedGroupKFold
 
 from mvitac.data.pack import Pack
@@ -40,14 +38,3 @@ def fold_splits(pack: Pack, task: AnyTask, num: int, learned: Sequence[Source]) 
         split[rows[test]] = "test"
         found.append(split)
     return found
-
-
-def with_split(pack: Pack, task: AnyTask, split: np.ndarray) -> Pack:
-    """``pack`` with this ``split`` [N] of ``task``."""
-    made = copy.copy(pack)
-    made.table = pack.table.set_column(
-        pack.table.schema.get_field_index(task.split), task.split, pa.array(split.tolist())
-    )
-    for name in ("_answers", "hidden"):
-        made.__dict__.pop(name, None)  # kept from the old split
-    return made
