@@ -47,7 +47,7 @@ def explore(argv: list[str]) -> None:
             raise
         raise ValueError("the explorer needs gradio: pip install -e '.[explore]' in mvitac's clone") from None
     print(f"explorer: http://{options.host}:{options.port or 7860} (or the next free port; Ctrl-C ends it)", flush=True)
-    serve(blocks, host=options.host, port=options.port)
+    serve(blocks, host=options.host, port=options.port or None)
 
 
 def _page(options: _Options) -> "gradio.Blocks":
