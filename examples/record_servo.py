@@ -53,7 +53,9 @@ class Recorded(Source):
         for frame in range(STEPS):
             action = -GAIN * (episode.pose - task.target)
             columns = {"id": f"{name}-{frame:03d}", "group": name, "touch_group": name, "split": split, "frame": frame}
-            columns |= {"along_mm": STEP_MM * frame} | dict(zip(task.names, action.tolist(), strict=True))
+            columns |= {"contact": not episode.lost, "along_mm": STEP_MM * frame} | dict(
+                zip(task.names, action.tolist(), strict=True)
+            )
             made.append(Sample(vision=None, touch=episode.touch(), columns=columns))
             episode.move(action + 0.1 * task.start * rng.standard_normal(len(action)))  # corrections are shown, too
         return made

@@ -1,10 +1,12 @@
 """A policy that needs touch, one that ignores it, and one that only reacts to it are told apart."""
 
-from dataclasses import dataclass
+import copy
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from mvitac.cli.main import main
@@ -65,6 +67,11 @@ def ignores(observation: dict[str, Any]) -> list[float]:
     return [60.0, float(observation["step"])]
 
 
+def wrong(observation: dict[str, Any]) -> list[float]:
+    """Touch misleads it, so any replacement makes it better."""
+    return [200 - observation["touch"].mean(), float(observation["state"][0])]
+
+
 class Fickle:
     """Its action changes with touch at random, without any use; it counts its episodes."""
 
@@ -83,6 +90,7 @@ class Fickle:
     [
         (needs, "The policy uses", "The policy does not use"),
         (ignores, "The policy does not use", "The policy does not use"),
+        (wrong, "Cannot tell", "The policy does not use"),
         (Fickle(), "Cannot tell", "The policy does not use"),
     ],
 )
@@ -96,16 +104,36 @@ def test_verdicts(pack: Pack, policy: Any, touch: str, vision: str) -> None:
 
 def test_each_replacement_gives_what_it_says(pack: Pack) -> None:
     episodes = read_episodes(pack)
-    force = np.stack([episodes.actions[rows, 0] for rows in episodes.rows.values()])
-    felt = {
-        kind: np.stack([act(needs, episodes, "touch", kind, 4)[rows, 0] for rows in episodes.rows.values()])
-        for kind in ("", "mean frame", "another episode", "{} frames ago")
-    }
+    force = np.stack([episodes.actions[rows, 0] for rows in episodes.rows])
+    kinds = ("", "mean frame", "another episode", "10 frames ago", "noise")
+    felt = {k: np.stack([act(needs, episodes, "touch", k)[rows, 0] for rows in episodes.rows]) for k in kinds}
     assert np.abs(felt[""] - force).max() < 1.5
     assert np.allclose(felt["mean frame"], force.mean(), atol=1.5)
     assert np.abs(felt["another episode"] - np.roll(force, -1, axis=0)).max() < 1.5
-    assert np.abs(felt["{} frames ago"][:, 4:] - force[:, :-4]).max() < 1.5
-    assert np.abs(felt["{} frames ago"][:, :5] - force[:, :1]).max() < 1.5
+    assert np.abs(felt["10 frames ago"][:, 10:] - force[:, :-10]).max() < 1.5
+    assert np.abs(felt["10 frames ago"][:, :11] - force[:, :1]).max() < 1.5
+    assert felt["noise"].std() < force.std() / 5 and np.abs(felt["noise"].mean() - force.mean()) < 15  # it is cut at 0
+
+
+def test_numbers_that_would_be_wrong(pack: Pack) -> None:
+    """Values named as a sense never hide a replacement; a component that never changes counts as 0, whatever is given."""
+    episodes = read_episodes(pack)
+    still = np.full((pack.num, 1), 0.1)
+    named = replace(episodes, actions=np.hstack([episodes.actions, still]), more={"touch": still, **episodes.more})
+    result = ablate(lambda o: [*needs(o), 0.1 + 1e-9 * o["touch"].mean()], named)
+    plain = ablate(needs, episodes)
+    for row, other in zip(result["rows"], plain["rows"], strict=True):
+        assert row["change"][0] == pytest.approx(other["change"][0] * 2 / 3)
+    assert result["rows"][0]["change"][0] > 0.1
+
+
+@pytest.mark.parametrize("cells", [["False", "True"], [False, True], [0, 1], [0.0, 1.0]])
+def test_contact_is_the_column_where_there_is_one(pack: Pack, cells: list[Any]) -> None:
+    made = copy.copy(pack)
+    asked = np.arange(pack.num) % 3 > 0
+    made.table = pack.table.append_column("contact", pa.array([cells[one] for one in asked.astype(int)]))
+    assert np.array_equal(read_episodes(made).touched(), asked)
+    assert not np.array_equal(read_episodes(pack).touched(), asked)
 
 
 def test_in_contact_and_over_time(pack: Pack) -> None:

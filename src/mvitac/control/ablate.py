@@ -5,12 +5,12 @@ A policy is a function of an observation, called for each frame of an episode in
     {"touch": uint8 [H, W, C], "vision": uint8 [H, W, 3], "step": 17, "state": float [S]} -> action [T]
 
 "state" is every task of values of the pack except "action", by its own name. A policy with memory has ``reset()``, which
-is called before each episode. Changes and errors are in standard deviations of the demonstrated action, the mean over its
-components, so that 1 is as large as what a policy does at all.
+is called before each episode; one that draws at random seeds itself there, or its own noise counts as change. Changes and
+errors are in standard deviations of the demonstrated action, the mean over its components; one that never changes is 0.
 """
 
 import importlib
-import importlib.util
+import runpy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,18 +20,15 @@ import numpy as np
 from tabulate import tabulate
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import ValueTask
 from mvitac.data.windows import places
 from mvitac.evaluation.intervals import mean_interval
 from mvitac.system.progress import work
 
 Policy = Callable[[dict[str, Any]], Any]
-KINDS = ("mean frame", "another episode", "{} frames ago", "noise")
-PLAUSIBLE = KINDS[
-    1:3
-]  # replacements that the policy may have seen in training: an effect of the others may be surprise
-SMALL = 0.02  # standard deviations of the action; below this a policy does not react
 LAG = 10
+PLAUSIBLE = ("another episode", f"{LAG} frames ago")  # what a policy may have met: others may just surprise it
+KINDS = ("mean frame", *PLAUSIBLE, "noise")
+SMALL = 0.02  # standard deviations of the action; below this a policy does not react
 
 
 @dataclass(frozen=True)
@@ -39,7 +36,7 @@ class Episodes:
     """Recorded episodes of a pack: rows in order, demonstrated actions [N, T], and what else a policy may read."""
 
     pack: Pack
-    rows: dict[str, np.ndarray]
+    rows: list[np.ndarray]
     actions: np.ndarray
     more: dict[str, np.ndarray]
 
@@ -50,9 +47,9 @@ class Episodes:
     def touched(self) -> np.ndarray:
         """bool [N]: column "contact" if there is one, else whether touch differs from the episode's first frame."""
         if "contact" in self.pack.table.column_names:
-            return self.pack.column("contact").astype(float) > 0.5
+            return np.isin(self.pack.column("contact").astype(str), ("True", "true", "1", "1.0"))
         found = np.zeros(self.pack.num, bool)
-        for rows in self.rows.values():
+        for rows in self.rows:
             images = self.pack.images["touch"][rows].astype(np.float32)
             found[rows] = np.abs(images - images[0]).mean((1, 2, 3)) > 3.0  # levels; noise of a sensor is 1 to 2
         return found
@@ -60,18 +57,17 @@ class Episodes:
 
 def read_episodes(pack: Pack) -> Episodes:
     """The episodes of ``pack``, its groups; ValueError if it has no task of values "action", no touch or one episode."""
-    values = {task.name: task for task in pack.spec.values}
-    action: ValueTask | None = values.pop("action", None)
-    if action is None or "touch" not in pack.spec.modalities:
+    values = {task.name: pack.values(task) for task in pack.spec.values}
+    if "action" not in values or "touch" not in pack.spec.modalities:
         raise ValueError(
             f"{pack.path} has no touch, or no values named action: pack it with --values action=a:mm,b:deg"
         )
-    groups, order = pack.column("group").astype(str), places(pack, pack.spec.window)[1]
-    rows = {name: np.flatnonzero(groups == name) for name in dict.fromkeys(groups.tolist())}
-    rows = {name: found[np.argsort(order[found], kind="stable")] for name, found in rows.items()}
+    which = np.unique(pack.column("group").astype(str), return_inverse=True)[1]
+    by = np.lexsort((places(pack, pack.spec.window)[1], which))
+    rows = np.split(by, np.cumsum(np.bincount(which))[:-1])
     if len(rows) < 2:
         raise ValueError(f"{pack.path} has one episode: episodes are its groups, give at least two")
-    return Episodes(pack, rows, pack.values(action), {name: pack.values(task) for name, task in values.items()})
+    return Episodes(pack, rows, values.pop("action"), values)
 
 
 def open_policy(text: str) -> Policy:
@@ -79,16 +75,10 @@ def open_policy(text: str) -> Policy:
     if (Path(text) / "config.json").is_file():
         return lerobot_policy(Path(text))
     place, _, name = text.rpartition(":")
-    if not place or not name.isidentifier():
+    if not place:
         raise ValueError(f"{text!r} is no policy: give module:function, FILE.py:function or a LeRobot policy's folder")
-    if place.endswith(".py"):
-        spec = importlib.util.spec_from_file_location(Path(place).stem, place)
-        assert spec and spec.loader
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-    else:
-        module = importlib.import_module(place)
-    if not callable(found := getattr(module, name, None)):
+    module = runpy.run_path(place) if place.endswith(".py") else vars(importlib.import_module(place))
+    if not callable(found := module.get(name)):
         raise ValueError(f"{place} has no function {name}")
     return found
 
@@ -107,6 +97,7 @@ def lerobot_policy(folder: Path) -> Policy:
     policy = get_policy_class(kind).from_pretrained(folder).eval()
     before, after = make_pre_post_processors(policy.config, str(folder))
 
+    @torch.no_grad()
     def act(observation: dict[str, Any]) -> np.ndarray:
         batch: dict[str, Any] = {"task": ""}
         for key in policy.config.image_features:
@@ -114,40 +105,36 @@ def lerobot_policy(folder: Path) -> Policy:
             batch[key] = torch.from_numpy(np.array(image)).permute(2, 0, 1)[None] / 255
         if "observation.state" in policy.config.input_features:
             batch["observation.state"] = torch.from_numpy(np.float32(observation["state"]))[None]
-        with torch.no_grad():
-            return after(policy.select_action(before(batch)))[0].cpu().numpy()
+        return after(policy.select_action(before(batch)))[0].cpu().numpy()
 
-    act.reset = policy.reset  # type: ignore[attr-defined]
+    def reset() -> None:
+        torch.manual_seed(0)  # a policy that samples draws the same with and without a replacement
+        policy.reset()
+
+    act.reset = reset  # type: ignore[attr-defined]
     return act
 
 
-def act(policy: Policy, episodes: Episodes, sense: str = "", kind: str = "", lag: int = LAG) -> np.ndarray:
-    """Actions [N, T] of ``policy`` in every row, with ``sense`` replaced by ``kind`` of ``KINDS``; NaN where no row is."""
-    found = np.full(episodes.actions.shape, np.nan)
-    names = list(episodes.rows)
-    images, mean, spread = episodes.pack.images, np.zeros((1, 1, 3)), np.ones(3)
-    if kind in ("mean frame", "noise"):
-        every = np.concatenate([np.asarray(images[sense][rows], np.float32) for rows in episodes.rows.values()])
-        mean, spread = every.mean(0), every.std((0, 1, 2))
-    for number, rows in enumerate(episodes.rows.values()):
-        if hasattr(policy, "reset"):
-            policy.reset()  # type: ignore[attr-defined]
-        other = episodes.rows[names[(number + 1) % len(names)]]
+def act(policy: Policy, episodes: Episodes, sense: str = "", kind: str = "") -> np.ndarray:
+    """Actions [N, T] of ``policy`` in every row, with ``sense`` replaced by ``kind`` of ``KINDS``."""
+    found, images = np.zeros(episodes.actions.shape), episodes.pack.images
+    mean, spread = _moments(images[sense], episodes.rows) if kind in ("mean frame", "noise") else (np.zeros(0),) * 2
+    for number, rows in enumerate(episodes.rows):
+        getattr(policy, "reset", lambda: None)()
+        other = episodes.rows[(number + 1) % len(episodes.rows)]
         rng = np.random.default_rng([0xAB1A7E, number])
         for step, row in enumerate(rows):
-            observation: dict[str, Any] = {each: images[each][row] for each in episodes.senses}
+            observation: dict[str, Any] = {key: values[row] for key, values in episodes.more.items()}
+            observation |= {"step": step, **{each: images[each][row] for each in episodes.senses}}
             if kind == "mean frame":
                 observation[sense] = (mean + 0.5).astype(np.uint8)
             elif kind == "another episode":
                 observation[sense] = images[sense][other[min(step, len(other) - 1)]]
             elif kind == "noise":
-                shape = observation[sense].shape
-                observation[sense] = np.clip(mean.mean((0, 1)) + spread * rng.standard_normal(shape), 0, 255).astype(
-                    "u1"
-                )
+                levels = mean.mean((0, 1)) + spread * rng.standard_normal(mean.shape)
+                observation[sense] = np.clip(levels, 0, 255).astype(np.uint8)
             elif kind:
-                observation[sense] = images[sense][rows[max(0, step - lag)]]
-            observation |= {"step": step, **{key: values[row] for key, values in episodes.more.items()}}
+                observation[sense] = images[sense][rows[max(0, step - LAG)]]
             action = np.asarray(policy(observation), float).ravel()
             if action.shape != found[row].shape:
                 raise ValueError(f"the policy gives {len(action)} numbers, episodes have actions of {len(found[row])}")
@@ -155,25 +142,35 @@ def act(policy: Policy, episodes: Episodes, sense: str = "", kind: str = "", lag
     return found
 
 
-def ablate(policy: Policy, episodes: Episodes, lag: int = LAG) -> dict[str, Any]:
+def _moments(images: Any, episodes: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The mean frame [H, W, C], and the standard deviation [C] of all pixels, read episode by episode."""
+    num, total, square = 0, np.zeros(images.shape[1:]), np.zeros(images.shape[-1])
+    for rows in episodes:
+        part = np.asarray(images[rows], np.float64)
+        num, total, square = num + len(rows), total + part.sum(0), square + (part**2).mean((1, 2)).sum(0)
+    mean = total / num
+    return mean, np.sqrt(square / num - mean.mean((0, 1)) ** 2)
+
+
+def ablate(policy: Policy, episodes: Episodes) -> dict[str, Any]:
     """What changes with each replacement of each sense, JSON-ready: {"error", "rows": [...], "verdicts": {sense: ...}}."""
-    wanted, scale = episodes.actions, np.nanstd(episodes.actions, axis=0) + 1e-12
-    kept = [rows[np.isfinite(wanted[rows]).all(1)] for rows in episodes.rows.values()]
-    parts = _parts(episodes, kept)
+    wanted = episodes.actions
+    still = np.nanmax(wanted, axis=0) == np.nanmin(wanted, axis=0)
+    scale = np.where(still, np.inf, np.nanstd(wanted, axis=0))
+    kept = [rows[np.isfinite(wanted[rows]).all(1)] for rows in episodes.rows]
+    parts, rows = _parts(episodes, kept), []
     with work("acting", 1 + len(episodes.senses) * len(KINDS), "times") as advance:
         normal = act(policy, episodes)
         advance()
         own = (np.abs(normal - wanted) / scale).mean(1)
-        rows = []
-        for sense in episodes.senses:
-            for kind in KINDS:
-                changed = act(policy, episodes, sense, kind, lag)
-                advance()
-                change = (np.abs(changed - normal) / scale).mean(1)
-                worse = (np.abs(changed - wanted) / scale).mean(1) - own
-                of = {part: _paired(worse, mask) for part, mask in parts.items()}
-                row = {"sense": sense, "kind": kind.format(lag), "plausible": kind in PLAUSIBLE}
-                rows.append({**row, "change": _paired(change, kept), "error": _paired(worse, kept), "parts": of})
+        for sense, kind in ((sense, kind) for sense in episodes.senses for kind in KINDS):
+            changed = act(policy, episodes, sense, kind)
+            advance()
+            change = (np.abs(changed - normal) / scale).mean(1)
+            worse = (np.abs(changed - wanted) / scale).mean(1) - own
+            of = {part: _paired(worse, each) for part, each in parts.items()}
+            paired = {"change": _paired(change, kept), "error": _paired(worse, kept), "parts": of}
+            rows.append({"sense": sense, "kind": kind, **paired})
     found = {sense: verdict(sense, [row for row in rows if row["sense"] == sense]) for sense in episodes.senses}
     return {"episodes": len(kept), "error": _paired(own, kept)[:3], "rows": rows, "verdicts": found}
 
@@ -195,12 +192,10 @@ def _paired(values: np.ndarray, episodes: Sequence[np.ndarray]) -> list[float]:
 
 def verdict(sense: str, rows: Sequence[Mapping[str, Any]]) -> str:
     """One sentence: whether the policy uses ``sense``. p is corrected for the number of plausible replacements."""
-    plausible = [row for row in rows if row["plausible"]]
-    for row in plausible:
-        if row["error"][0] > 0 and row["error"][3] * len(plausible) < 0.05:
-            size = (
-                f"by {row['error'][0]:.2g} with it replaced by {row['kind']} (p {row['error'][3] * len(plausible):.2g})"
-            )
+    for row in rows:
+        mean, p = row["error"][0], row["error"][3] * len(PLAUSIBLE)
+        if row["kind"] in PLAUSIBLE and mean > 0 and p < 0.05:
+            size = f"by {mean:.2g} with it replaced by {row['kind']} (p {p:.2g})"
             return f"The policy uses {sense}: its error grows {size}."
     if max(row["change"][2] for row in rows) < SMALL:
         return f"The policy does not use {sense}: no replacement changes its action by {SMALL} standard deviations."
@@ -209,14 +204,12 @@ def verdict(sense: str, rows: Sequence[Mapping[str, Any]]) -> str:
 
 def report(result: Mapping[str, Any]) -> str:
     """The result as text."""
-    head = ["replaced", "by", "change of action", "change of error", "p", *next(iter(result["rows"]))["parts"]]
+    head = ["replaced", "by", "change of action", "change of error", "p", *result["rows"][0]["parts"]]
     lines = []
     for row in result["rows"]:
         change, worse = (f"{v[0]:.2f} [{v[1]:.2f}, {v[2]:.2f}]" for v in (row["change"], row["error"]))
         parts = [f"{value[0]:+.2f}" for value in row["parts"].values()]
         lines.append([row["sense"], row["kind"], change, worse, f"{row['error'][3]:.2g}", *parts])
-    mean, low, high = result["error"]
-    about = (
-        f"{result['episodes']} episodes, error {mean:.2f} [{low:.2f}, {high:.2f}], in standard deviations of the action"
-    )
+    error = "{:.2f} [{:.2f}, {:.2f}]".format(*result["error"])
+    about = f"{result['episodes']} episodes, error {error}, in standard deviations of the action"
     return "\n".join([about, tabulate(lines, head), *result["verdicts"].values()])
