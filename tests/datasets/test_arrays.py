@@ -261,9 +261,17 @@ def test_numbers_of_more_than_8_bits(tmp_path: Path) -> None:
     options: dict[str, Any] = {"path": tmp_path / "a.h5", "size": 16, "group": "frame"}
     pack = packed(FolderConfig(**options), tmp_path / "p")
     assert levels(pack, "touch") == np.rint(deep[:, 0, 0, 0] * 255).tolist() and max(levels(pack, "vision")) == 8
-    assert "vision has more than 8 bits: 0 is black, 65535, or 1 of floats, white" in " ".join(pack.spec.notes)
+    assert (
+        "vision has more than 8 bits: 0 is black, 65535 white touch has more than 8 bits: 0 is black, 1 white"
+        in " ".join(pack.spec.notes)
+    )
     pack = packed(FolderConfig(**options, range=("vision=0:2000",)), tmp_path / "q")
-    assert max(levels(pack, "vision")) == 255 and "0.0 is black, 2000.0 white" in " ".join(pack.spec.notes)
+    assert max(levels(pack, "vision")) == 255 and "0 is black, 2000 white" in " ".join(pack.spec.notes)
+    write(tmp_path / "b.h5", {"touch": grays(*range(20)).astype(np.int64), "vision": (300 * deep[..., :1]).astype(int)})
+    pack = packed(FolderConfig(**(options | {"path": tmp_path / "b.h5"}), vision=""), tmp_path / "i")
+    assert levels(pack, "touch") == list(range(20))  # 8 bits, however they are stored
+    with pytest.raises(ValueError, match=r"its values lie in 268 to 268, not 0 to 255: --data\.range COLUMN=LOW:HIGH"):
+        packed(FolderConfig(**(options | {"path": tmp_path / "b.h5"})), tmp_path / "j")
     rows = []
     for i in range(20):  # a field of deformation in mm
         np.save(tmp_path / f"{i}.npy", np.full((16, 16, 2), 0.1 * i - 1, np.float32))

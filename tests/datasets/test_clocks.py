@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import copy
+import csv
+import json
 import re
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +21,8 @@ from mvitac.data.checks.examine import examine_source
 from mvitac.data.checks.image_stats import look_at
 from mvitac.data.checks.value_checks import time_shift
 from mvitac.data.pack import Pack
+from mvitac.data.stamps import seconds
 from mvitac.datasets.folder import FolderConfig
-from mvitac.datasets.table.clocks import seconds
 from support.videos import film, shade, write_video
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "wedge_force" / "manifest.csv"
@@ -111,9 +115,6 @@ def test_times_of_frames_may_stand_beside_the_video(tmp_path: Path) -> None:
     pack = packed(tmp_path / "set", tmp_path / "p", log=("../logs.csv:ns",), values=("Fz:N",))
     frame, late = pack.column("frame").astype(int), 5 * (pack.column("recording") == "b")
     assert pack.num == 20 and np.allclose(pack.values(pack.spec.values[0])[:, 0], force(0.05 * frame + late), atol=1e-3)
-    (tmp_path / "set/b_timestamps.txt").write_text("1\n2")
-    with pytest.raises(ValueError, match=r"b_timestamps\.txt has 2 times, b\.mp4 has 50 frames"):
-        packed(tmp_path / "set", tmp_path / "no")
 
 
 def test_two_cameras_out_of_step_are_paired_by_time(tmp_path: Path) -> None:
@@ -154,6 +155,52 @@ def test_a_list_of_another_camera_is_a_log(tmp_path: Path) -> None:
     assert pack.num == 30 and (abs(red["touch"] / 30 - red["vision"] / 15 - 0.01) <= 0.03).all()
 
 
+def spoil(*rows: int, **cells: Callable[[str], str]) -> Callable[[Path], None]:
+    """Change cells of the first recording's log in ``rows`` (from 1; default: all)."""
+
+    def change(root: Path) -> None:
+        file = root / "0/force.csv"
+        with file.open(newline="") as stream:
+            lines = list(csv.DictReader(stream))
+        for i, line in enumerate(lines, 1):
+            line |= {name: made(line[name]) for name, made in cells.items() if i in (rows or (i,))}
+        write_csv(file, **{name: [line[name] for line in lines] for name in lines[0]})
+
+    return change
+
+
+def own_times(name: str, *lines: object) -> Callable[[Path], None]:
+    return lambda root: (root / "0" / f"gel_timestamps.{name}").write_text("\n".join(map(str, lines))) and None
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (
+            lambda root: (root / "0/force.csv").rename(root / "force.csv"),
+            r"would be the log of 2 recordings at the same",
+        ),
+        (
+            spoil(stamp=lambda cell: str(round(1000 * float(cell)) + 97)),
+            r"stamps are 10 s apart, .*: are they seconds\?",
+        ),
+        (spoil(36, Fz=lambda _: "1 N"), r"row 36: Fz is '1 N', which cannot be interpolated"),
+        (spoil(36, stamp=lambda _: "then"), r"force\.csv, column stamp: 'then' is no time: give seconds"),
+        (spoil(36, stamp=lambda _: ""), r"row 36: column 'stamp' \(time\) is empty"),
+        (own_times("txt", *range(30), 20, *range(31, 50)), r"gel_timestamps\.txt: time 31 is before the one above it"),
+        (
+            own_times("csv", "frame,ns", *(f"{i},{i}" for i in range(50))),
+            "unknown column 'time': choose from frame, ns",
+        ),
+        (own_times("txt", *range(49)), r"gel_timestamps\.txt has 49 times, gel\.mp4 has 50 frames"),
+    ],
+)
+def test_logs_that_would_give_wrong_numbers(tmp_path: Path, change: Callable[[Path], None], says: str) -> None:
+    change(recorded(tmp_path / "set", num=2))
+    with pytest.raises(ValueError, match=says):
+        packed(tmp_path / "set", tmp_path / "p", **LOG)
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [
@@ -169,11 +216,33 @@ def test_logs_that_cannot_be_joined(tmp_path: Path, options: dict[str, Any], say
         packed(recorded(tmp_path / "set", num=1), tmp_path / "p", **{**LOG, **options})
 
 
-def test_stamps_are_seconds_whatever_their_unit() -> None:
+def test_stamps_are_seconds_whatever_their_unit(monkeypatch: pytest.MonkeyPatch) -> None:
     times = START + np.array([0.25, 3.5])
     for scale in (1, 1e3, 1e6, 1e9):
-        assert np.allclose(seconds([f"{t * scale:.0f}" if scale > 1 else str(t) for t in times]), times, atol=1e-3)
-    assert np.isnan(seconds(["", "1"])[0]) and seconds(["1.5"])[0] == 1.5
+        assert np.allclose(seconds([f"{t * scale:.0f}" if scale > 1 else str(t) for t in times], ""), times, atol=1e-3)
+    assert np.isnan(seconds(["", "1"], "")[0]) and seconds(["1.5"], "")[0] == 1.5
+    monkeypatch.setenv("TZ", "America/New_York")  # a date without an offset is the same on every computer
+    time.tzset()
+    dates = ["2023-11-14T22:13:20.25", "2023-11-14T17:13:23.5-05:00"]
+    assert np.allclose(seconds(dates, ""), times)
+    monkeypatch.undo()
+    time.tzset()
+
+
+def test_a_table_of_videos_takes_the_times_beside_them_and_elements_of_lists_from_a_log(tmp_path: Path) -> None:
+    """The camera ran at half the rate that its file says."""
+    for k in range(3):
+        film(tmp_path / f"{k}/gel.mp4", 50, which=k)
+        (tmp_path / f"{k}/gel_timestamps.txt").write_text("\n".join(str(0.08 * i) for i in range(50)))
+        rows = [{"stamp": t, "wrench": [0, force(t)]} for t in np.arange(-1, 5, 0.01).tolist()]
+        (tmp_path / f"{k}/force.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    cells = [(f"{k}/gel.mp4", i, k) for k in range(3) for i in range(50)]
+    write_csv(tmp_path / "m.csv", **dict(zip(("touch", "frame", "take"), zip(*cells, strict=True), strict=True)))
+    options: dict[str, Any] = {"log": ("force.jsonl:stamp",), "values": ("wrench[1]:N",), "group": "take"}
+    pack = packed(tmp_path / "m.csv", tmp_path / "p", **options)
+    assert np.allclose(
+        pack.values(pack.spec.values[0])[:, 0], force(0.08 * pack.column("frame").astype(int)), atol=1e-6
+    )
 
 
 def test_videos_without_labels_are_data(tmp_path: Path) -> None:
@@ -195,13 +264,13 @@ def test_videos_without_labels_are_data(tmp_path: Path) -> None:
 def test_images_without_labels_are_one_recording(tmp_path: Path) -> None:
     for i in range(20):
         Image.new("RGB", (16, 16), (10 * i, 0, 0)).save(
-            (tmp_path / "digit").mkdir(exist_ok=True) or tmp_path / f"digit/{i}.png"
+            (tmp_path / "digit").mkdir(exist_ok=True) or tmp_path / f"digit/frame_{i}.png"
         )
     pack = packed(tmp_path / "digit", tmp_path / "p")
     assert pack.images["touch"][:, 0, 0, 0].tolist() == [10 * i for i in range(20)]  # 2 before 10
     assert pack.column("split").tolist() == ["train"] * 18 + ["val"] * 2 and "time" not in pack.table.column_names
     for i in range(20):
-        (tmp_path / f"digit/{i}.png").rename(tmp_path / f"digit/{START + i / 10:.1f}.png")
+        (tmp_path / f"digit/frame_{i}.png").rename(tmp_path / f"digit/{START + i / 10:.1f}.png")
     times = START + np.arange(-1, 4, 0.05)
     write_csv(tmp_path / "force.csv", t=times, Fz=force(times - START))
     joined = packed(tmp_path / "digit", tmp_path / "q", log=("../force.csv:t",), only=("Fz>=2.5",), every=1)

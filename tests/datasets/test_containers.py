@@ -371,6 +371,23 @@ def test_image_parquet_of_the_hub(tmp_path: Path) -> None:
     assert len({level(image) for image in pack.images["touch"]}) == 30
 
 
+def test_the_scale_of_16_bits_holds_inside_tars_and_parquet(tmp_path: Path) -> None:
+    rows = []
+    with tarfile.open(tmp_path / "a.tar", "w") as tar:
+        for i in range(20):
+            buffer = io.BytesIO()
+            Image.fromarray(np.full((16, 20), 10 * i, np.uint16)).save(buffer, "PNG")
+            add(tar, f"{i:02d}.touch.png", buffer.getvalue())
+            rows.append({"touch": buffer.getvalue(), "thing": i})
+    pq.write_table(pa.Table.from_pylist(rows), tmp_path / "a.parquet")
+    options: dict[str, Any] = {"range": ("touch=0:200",), "size": 16}
+    tar, hub = WebDatasetConfig(path=tmp_path / "a.tar", **options), HubConfig(path=tmp_path / "a.parquet", **options)
+    for config in (tar, hub):
+        pack = packed(config, tmp_path / config.name)
+        assert np.abs(pack.images["touch"][:, 8, 8, 0] - 12.75 * np.arange(20)).max() <= 0.5
+        assert pack.spec.notes[0] == "touch has more than 8 bits: 0 is black, 200 white"
+
+
 def test_a_table_shows_no_image_of_other_folders(tmp_path: Path) -> None:
     secret, link = tmp_path / "secret.png", tmp_path / "data" / "link.png"
     link.parent.mkdir()

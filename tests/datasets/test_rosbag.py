@@ -35,9 +35,9 @@ def raw(time: float, pixels: np.ndarray, encoding: str) -> Any:
     return kind(header=stamped(time), **shape, step=lines.shape[1], data=lines.ravel())
 
 
-def compressed(time: float, level: int) -> Any:
+def compressed(time: float, pixels: np.ndarray) -> Any:
     buffer = io.BytesIO()
-    Image.new("RGB", (32, 24), (level, 0, 0)).save(buffer, "PNG")
+    Image.fromarray(pixels).save(buffer, "PNG")
     data = np.frombuffer(buffer.getvalue(), np.uint8)
     return STORE.types["sensor_msgs/msg/CompressedImage"](header=stamped(time), format="png", data=data)
 
@@ -51,14 +51,19 @@ def wrench(time: float, fz: float) -> Any:
 
 
 def write_bag(path: Path, plugin: StoragePlugin, number: int, pixels: Any = None) -> Path:
-    """2 s: the gel at 25 Hz (blue = frame), the camera at 10 Hz, force at 100 Hz (Fz = 3 t); received 1 to 30 ms late."""
+    """2 s: the gel at 25 Hz (blue = frame), the camera at 10 Hz, force at 100 Hz (Fz = 3 t); received 1 to 30 ms late.
+
+    With ``pixels``, a depth, both show it.
+    """
     rng, messages = np.random.default_rng(number), []
     for i in range(50):
         frame = np.zeros((16, 20, 3), np.uint8) if pixels is None else pixels
         if pixels is None:
             frame[..., 0], frame[..., 2] = 5 * i, 100 + number
         messages.append((GEL, i / 25, raw(i / 25, frame, "bgr8" if pixels is None else "16UC1")))
-    messages += [(FRONT, i / 10 + 0.004, compressed(i / 10 + 0.004, 10 * i)) for i in range(20)]
+    for i in range(20):
+        shown = np.full((24, 32, 3), (10 * i, 0, 0), np.uint8) if pixels is None else pixels[..., 0]
+        messages.append((FRONT, i / 10 + 0.004, compressed(i / 10 + 0.004, shown)))
     messages += [(WRENCH, i / 100 + 0.001, wrench(i / 100 + 0.001, 3 * (i / 100 + 0.001))) for i in range(200)]
     kinds = {topic: message.__msgtype__ for topic, _, message in messages}
     with Writer(path, version=9, storage_plugin=plugin) as bag:
@@ -77,33 +82,40 @@ def packed(config: RosbagConfig, out: Path) -> Pack:
 @pytest.mark.parametrize("plugin", StoragePlugin)
 def test_topics_are_joined_by_the_time_in_their_headers(tmp_path: Path, plugin: StoragePlugin) -> None:
     for number in range(3):
-        write_bag(tmp_path / f"bags/grasp_{number}", plugin, number)
+        write_bag(tmp_path / f"bags/grasp.{number}", plugin, number)
     options: dict[str, Any] = {"touch": (GEL,), "vision": FRONT, "values": (f"{WRENCH}.wrench.force.z:N",), "size": 16}
     config = RosbagConfig(path=tmp_path / "bags", every=1, tolerance=0.045, **options)
     pack = packed(config, tmp_path / "pack")
     time, which = pack.column("time").astype(float) - START, pack.column("recording")
-    assert set(which) == {"grasp_0", "grasp_1", "grasp_2"} and pack.spec.group_by == "recording"
+    assert set(which) == {"grasp.0", "grasp.1", "grasp.2"} and pack.spec.group_by == "recording"
     assert np.allclose(pack.values(pack.spec.values[0])[:, 0], 3 * time, atol=1e-5)
     blue, red = pack.images["touch"][:, 0, 0, 2].astype(int), pack.images["touch"][:, 0, 0, 0].astype(int)
     assert (blue == np.round(125 * time)).all() and (red == [100 + int(name[-1]) for name in which]).all()
     seen = pack.images["vision"][:, 0, 0, 0] / 100 + 0.004
     assert (abs(seen - time) <= 0.0451).all() and (pack.column("frame").astype(int) == np.round(25 * time)).all()
     assert pack.num == 3 * 48 and "6 images without all others are left out" in pack.spec.notes[0]
-    few = packed(RosbagConfig(path=tmp_path / "bags/grasp_1", touch=(GEL,)), tmp_path / "few")
+    few = packed(RosbagConfig(path=tmp_path / "bags/grasp.1", touch=(GEL,)), tmp_path / "few")
     assert few.images["touch"][:, 0, 0, 2].tolist() == list(range(0, 250, 25))
 
 
 def test_depth_and_what_cannot_be(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", StoragePlugin.MCAP, 0, np.full((16, 20, 1), 900, np.uint16))
-    pack = packed(RosbagConfig(path=bag, touch=(GEL,), range=(f"{GEL}=0:1000",), values=()), tmp_path / "p")
-    assert (pack.images["touch"] == 230).all()
+    scale = (f"{GEL}=0:1000", f"{FRONT}=0:1800")
+    pack = packed(RosbagConfig(path=bag, touch=(GEL,), vision=FRONT, range=scale, tolerance=0.1), tmp_path / "p")
+    assert (pack.images["touch"] == 230).all() and (pack.images["vision"] == 128).all()
+    assert f"{GEL} has more than 8 bits: 0 is black, 1000 white" in pack.spec.notes
     for options, says in (
         ({}, rf"has the image topics {GEL}, {FRONT}: --data\.vision or"),
         ({"touch": ("/digit/image",)}, rf"unknown topic '/digit/image': .*did you mean '{GEL}'"),
         ({"touch": (GEL,), "values": (f"{WRENCH}.wrench.force.w:N",)}, "no field wrench.force.w: unknown field 'w'"),
+        ({"touch": (GEL,), "values": (f"{WRENCH}.wrench.force.z[1]:N",)}, r"no field wrench\.force\.z\[1\]: unknown"),
         ({"touch": (GEL,), "values": ("/ft/wrong.x:N",)}, "unknown column '/ft/wrong.x'"),
     ):
         with pytest.raises(ValueError, match=says):
             RosbagConfig(path=bag, **options).source()
+    file = bag / "bag.mcap"
+    file.write_bytes(file.read_bytes()[:5000])
+    with pytest.raises(ValueError, match=r"cannot be read as a bag \(.*\): is it complete"):
+        RosbagConfig(path=bag, touch=(GEL,)).source()
     with pytest.raises(ValueError, match="is no bag and holds none"):
         RosbagConfig(path=tmp_path / "none", touch=(GEL,)).source()

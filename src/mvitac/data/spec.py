@@ -12,7 +12,6 @@ UNGROUPED = "no --group was given"  # begins the note of a table whose rows are 
 SUFFIXES = {"raw": ".npy", "jpeg": ".jpegs"}  # of image files, by how images are stored
 Store = Literal["raw", "jpeg"]
 QUALITY = 95
-STAMPS = ("time", "stamp", "timestamp")  # columns with the time of a row, in seconds
 PHASES = ("before", "during", "after")  # values of column phase: the moments of a grasp
 
 

@@ -36,7 +36,6 @@ split folders, split. A manifest is checked completely before the first image is
 the header.
 """
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -46,12 +45,11 @@ from mvitac.datasets.table.arrays import read_arrays
 from mvitac.datasets.table.folders import list_images, list_videos, to_train
 from mvitac.datasets.table.image_refs import ARRAYS
 from mvitac.datasets.table.manifest import READERS, Manifest, read_manifest
-from mvitac.datasets.table.table import RowsConfig
-from mvitac.registry import check_range
+from mvitac.datasets.table.table import RecordedConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class FolderConfig(RowsConfig):
+class FolderConfig(RecordedConfig):
     """A folder of images, a manifest with vision path, touch path, labels, group and split, or HDF5 files."""
 
     name: ClassVar[str] = "folder"
@@ -61,14 +59,6 @@ class FolderConfig(RowsConfig):
     files, of videos, of class folders or of images."""
     pictures: Literal["touch", "vision"] = "touch"
     """Modality of images and videos that nothing names (<root>/<class>/*.jpg, <root>/*.mp4)."""
-
-    every: int | None = None
-    """Without a table: use every n-th frame of a recording; by default every fifth of a video and all images."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.every is not None:
-            check_range(self, 1, math.inf, "every")
 
     def manifest(self) -> Manifest:
         if not self.path.exists():
@@ -89,6 +79,3 @@ class FolderConfig(RowsConfig):
             raise ValueError(f"{self.path} is no table: its name must end in {', '.join((*READERS, *ARRAYS, *VIDEOS))}")
         found = found or list_images(self.path, self.pictures, self.every)
         return found if self.labels or self.values else to_train(found)
-
-    def unused(self) -> tuple[str, ...]:
-        return (*super().unused(), *(("every",) if self.every is None else ()))

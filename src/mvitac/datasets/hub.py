@@ -54,7 +54,7 @@ class HubConfig(RowsConfig):
         for column, places in found.items():
             if len(places) < len(rows):
                 raise ValueError(f"{self.path}: image column {column!r} is not in every file")
-        return Manifest.of(self.path, rows, found, content=sorted(found))
+        return Manifest.of(self.path, rows, found)
 
 
 def _read(

@@ -7,31 +7,28 @@ the path of a field, e.g. /wrench.wrench.force.z. Each bag is a recording. Topic
 when a message was received where that is 0.
 """
 
-import io
-import math
 from collections.abc import Hashable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from PIL import Image
 
-from mvitac.data.images import decode
 from mvitac.datasets.table.clocks import joined, nearest
 from mvitac.datasets.table.columns import element_of
 from mvitac.datasets.table.folders import recording_row
-from mvitac.datasets.table.image_refs import Damage, ImageRef, picture
+from mvitac.datasets.table.image_refs import ImageRef
 from mvitac.datasets.table.manifest import Manifest, Row, text_of
-from mvitac.datasets.table.table import RowsConfig
-from mvitac.registry import check_range, unknown
+from mvitac.datasets.table.table import RecordedConfig
+from mvitac.registry import unknown
 from mvitac.system.files import brief
 
 CHANNELS = {"mono": 1, "8UC1": 1, "16UC1": 1, "32FC1": 1, "bgr": 3, "rgb": 3, "8UC3": 3, "bgra": 4, "rgba": 4}
 
 
 @dataclass(frozen=True, kw_only=True)
-class RosbagConfig(RowsConfig):
+class RosbagConfig(RecordedConfig):
     """Bags of ROS 2 (mcap, db3) or ROS 1: image topics, joined with each other and with numbers by time."""
 
     name: ClassVar[str] = "rosbag"
@@ -42,24 +39,16 @@ class RosbagConfig(RowsConfig):
     """Topic of camera images."""
     touch: tuple[str, ...] = ()
     """Topic of tactile images, or two to stack. Its images (or else those of vision) are the rows."""
-    every: int = 5
-    """Use every n-th image."""
+    every: int | None = 5
     group: str | None = "recording"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_range(self, 1, math.inf, "every")
 
     @classmethod
     def reads(cls, path: Path) -> bool:
         return path.suffix == ".bag" or (path / "metadata.yaml").is_file()
 
-    def unused(self) -> tuple[str, ...]:
-        return tuple(name for name in super().unused() if name not in ("tolerance", "interpolate"))
-
     def manifest(self) -> Manifest:
         cameras = [topic for topic in (*self.touch, self.vision) if topic]
-        asked = {
+        named = (
             *self.labels,
             *self.numbers(),
             *self.conditioned(),
@@ -67,42 +56,40 @@ class RosbagConfig(RowsConfig):
             self.touch_group,
             self.split,
             self.sensor,
-        }
+        )
+        smooth, every = self.numbers() if self.interpolate == "linear" else (), self.every or 1
         rows: list[Row] = []
         images: dict[str, list[ImageRef | None]] = {topic: [] for topic in cameras}
         dropped = 0
         for bag in _bags(self.path):
-            seen = _read(bag, cameras, [name for name in asked if name])
-            times, stamps = {t: np.array([time for time, _ in seen[t]]) for t in cameras}, {}
-            for topic in cameras:
-                order = np.argsort(times[topic], kind="stable")
-                times[topic], stamps[topic] = times[topic][order], [seen[topic][i][1] for i in order]
-            own = times[cameras[0]][:: self.every]
-            at = {topic: nearest(times[topic], own) for topic in cameras}
-            good = np.max([away for _, away in at.values()], axis=0) <= self.tolerance
+            seen = _read(bag, cameras, [name for name in dict.fromkeys(named) if name])
+            own = seen[cameras[0]][0][::every]
+            good = np.ones(len(own), bool)
             cells: list[Row] = [{} for _ in own]
-            for topic in sorted(seen.keys() - set(cameras)):
-                log = Manifest.of(bag, [row for _, row in seen[topic]])
-                when = np.array([time for time, _ in seen[topic]])
-                order = np.argsort(when, kind="stable")
-                smooth = self.numbers() if self.interpolate == "linear" else ()
-                found, _ = joined(log, order, when[order], own, smooth, self.tolerance)
-                good &= np.array([bool(row) for row in found])
-                cells = [{**known, **row} for known, row in zip(cells, found, strict=True)]
+            at: dict[str, list[int]] = {}
+            for topic, (times, found) in seen.items():
+                if topic in cameras:
+                    index, away = nearest(times, own)
+                    good &= away <= self.tolerance
+                    at[topic] = [found[i] for i in index] if len(times) else []
+                    continue
+                joins, _ = joined(Manifest.of(bag, found), times, own, smooth, self.tolerance)
+                good &= np.array([bool(row) for row in joins], bool)
+                cells = [{**known, **row} for known, row in zip(cells, joins, strict=True)]
             dropped += int((~good).sum())
-            name = bag.stem if bag != self.path else bag.resolve().stem
+            name = bag.relative_to(self.path).as_posix() if bag != self.path else bag.resolve().name
             for i in np.flatnonzero(good).tolist():
-                rows.append(recording_row(name, i * self.every, float(own[i])) | cells[i])
+                rows.append(recording_row(name.removesuffix(".bag"), i * every, float(own[i])) | cells[i])
                 for topic in cameras:
-                    images[topic].append(Message(str(bag), topic, stamps[topic][int(at[topic][0][i])]))
+                    images[topic].append(Message(str(bag), topic, at[topic][i]))
         note = (
             f"topics are joined by time within {self.tolerance:g} s; {dropped} images without all others are left out"
         )
-        return Manifest.of(self.path, rows, images, content=sorted(images), notes=(note,))
+        return Manifest.of(self.path, rows, images, notes=(note,))
 
 
 def _bags(path: Path) -> list[Path]:
-    found = [path] if (path / "metadata.yaml").is_file() or path.suffix == ".bag" else []
+    found = [path] if RosbagConfig.reads(path) else []
     if not found and path.is_dir():
         found = sorted([*(file.parent for file in path.rglob("metadata.yaml")), *path.rglob("*.bag")])
     if not found:
@@ -112,21 +99,25 @@ def _bags(path: Path) -> list[Path]:
     return found
 
 
-def _open(bag: Path) -> Any:
+@contextmanager
+def _opened(bag: Path) -> Iterator[Any]:
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ModuleNotFoundError:
         raise ValueError(f"{bag} needs rosbags: pip install 'mvitac[rosbags]'") from None
     try:
-        return AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-    except Exception as error:  # rosbags has no common base class
-        raise ValueError(f"{bag} cannot be read as a bag ({brief(error)})") from None
+        with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            yield reader
+    except (ValueError, OSError):
+        raise
+    except Exception as error:  # rosbags and what it reads with have no common base class
+        raise ValueError(f"{bag} cannot be read as a bag ({brief(error)}): is it complete?") from None
 
 
-def _read(bag: Path, cameras: Sequence[str], asked: Sequence[str]) -> dict[str, list[tuple[float, Any]]]:
-    """Return topic -> time in seconds of each message, with when it was received in ns (images) or its fields."""
-    with _open(bag) as reader:
+def _read(bag: Path, cameras: Sequence[str], asked: Sequence[str]) -> dict[str, tuple[np.ndarray, list[Any]]]:
+    """Return topic -> ascending times in seconds, with when each message was received in ns (images) or its fields."""
+    with _opened(bag) as reader:
         topics = {connection.topic: connection.msgtype for connection in reader.connections}
         if not cameras:
             shown = [topic for topic, kind in topics.items() if kind.endswith("Image")]
@@ -136,27 +127,28 @@ def _read(bag: Path, cameras: Sequence[str], asked: Sequence[str]) -> dict[str, 
         for topic in cameras:
             if topic not in topics:
                 raise ValueError(f"{bag}: {unknown('topic', topic, topics)}")
-        wanted = {topic for topic in topics for name in asked if name.startswith(f"{topic}.")}
-        found: dict[str, list[tuple[float, Any]]] = {topic: [] for topic in (*cameras, *wanted)}
+        fields = {t: [name for name in asked if name.startswith(f"{t}.")] for t in sorted(topics) if t not in cameras}
+        found: dict[str, list[tuple[float, Any]]] = {
+            topic: [] for topic in (*cameras, *(t for t in fields if fields[t]))
+        }
         for connection, received, raw in reader.messages([c for c in reader.connections if c.topic in found]):
-            message = reader.deserialize(raw, connection.msgtype)
+            topic, message = connection.topic, reader.deserialize(raw, connection.msgtype)
             stamp = getattr(getattr(message, "header", None), "stamp", None)
             time = 1e-9 * received if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
-            topic, fields = connection.topic, {}
-            for name in asked if topic in wanted else ():
-                if name.startswith(f"{topic}."):
-                    fields[name] = _field(message, name.removeprefix(f"{topic}."))
-            value = received if topic in cameras else fields
-            found[topic].append((time or 1e-9 * received, value))
-    return found
+            row = {name: _field(message, name.removeprefix(f"{topic}.")) for name in fields.get(topic, ())}
+            found[topic].append((time or 1e-9 * received, row or received))
+    ordered = {topic: sorted(each, key=lambda one: one[0]) for topic, each in found.items()}
+    return {topic: (np.array([time for time, _ in each]), [v for _, v in each]) for topic, each in ordered.items()}
 
 
 def _field(message: Any, path: str) -> str:
     for name in path.split("."):
         vector, number = element_of(name)
-        if not hasattr(message, vector or name):
-            raise ValueError(f"a message has no field {path}: {unknown('field', vector or name, vars(message))}")
-        message = getattr(message, vector)[number] if vector else getattr(message, name)
+        try:
+            message = getattr(message, vector)[number] if vector else getattr(message, name)
+        except (AttributeError, TypeError, IndexError):
+            known = vars(message) if hasattr(message, "__dict__") else ()
+            raise ValueError(f"a message has no field {path}: {unknown('field', name, known)}") from None
     return text_of(message)
 
 
@@ -173,27 +165,27 @@ class Message(ImageRef):
     def container(self) -> Hashable:
         return (self.path, self.topic)
 
-    @staticmethod
-    def read(refs: Sequence[Any], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
-        at = {ref.stamp: ref for ref in refs}
-        with _open(Path(refs[0].path)) as reader:
-            own = [connection for connection in reader.connections if connection.topic == refs[0].topic]
-            for connection, received, raw in reader.messages(own, start=min(at), stop=max(at) + 1):
-                if ref := at.pop(received, None):
-                    try:
-                        yield ref, _image(reader.deserialize(raw, connection.msgtype), ref)
-                    except ValueError as error:
-                        lost[ref] = str(error)
+    @contextmanager
+    def opened(self) -> Iterator[tuple[Any, Iterator[Any]]]:
+        with _opened(Path(self.path)) as reader:
+            own = [connection for connection in reader.connections if connection.topic == self.topic]
+            yield reader, reader.messages(own, start=self.stamp)
+
+    def stored(self, container: tuple[Any, Iterator[Any]]) -> bytes | np.ndarray:
+        reader, messages = container
+        connection, _, raw = next(found for found in messages if found[1] == self.stamp)
+        return _pixels(reader.deserialize(raw, connection.msgtype), str(self))
 
 
-def _image(message: Any, ref: ImageRef) -> Image.Image:
+def _pixels(message: Any, name: str) -> bytes | np.ndarray:
+    """Return the file in a CompressedImage, or the numbers [H, W, 1 or 3] of an Image, red first."""
     if not hasattr(message, "encoding"):
-        return decode(io.BytesIO(message.data.tobytes()), str(ref))
+        return message.data.tobytes()
     code = message.encoding
     channels = CHANNELS.get(code) or CHANNELS.get(code.rstrip("168"), 0)
     kind = np.dtype(np.float32 if "32F" in code else np.uint16 if "16" in code else np.uint8)
     if not channels:
-        raise ValueError(f"{ref} has the encoding {code}: {', '.join(CHANNELS)} are read")
+        raise ValueError(f"{name} has the encoding {code}: {', '.join(CHANNELS)} are read")
     lines = message.data.view(kind.newbyteorder(">" if message.is_bigendian else "<")).reshape(message.height, -1)
     pixels = lines[:, : message.width * channels].reshape(message.height, message.width, channels)[:, :, :3]
-    return picture(pixels[:, :, ::-1] if code.startswith("bgr") else pixels, ref)
+    return pixels[:, :, ::-1] if code.startswith("bgr") else pixels

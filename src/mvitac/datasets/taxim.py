@@ -66,7 +66,7 @@ class Taxim(Source):
             ),
             group_by="contact",
             licence="MIT" if real else LICENCE,
-            source="https://pypi.org/project/taxim" if real else f"mvitac.sim.ball version {ball.VERSION}",
+            source="package taxim" if real else f"mvitac.sim.ball version {ball.VERSION}",
             difference=self.config.difference,
             notes=("circles of gelsight_mini were drawn by hand, up to 0.8 mm from the visible centre",) * real,
         )

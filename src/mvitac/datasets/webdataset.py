@@ -48,7 +48,7 @@ class WebDatasetConfig(RowsConfig):
         if not columns:
             raise ValueError(f"{self.path} holds no images ({', '.join(IMAGES)}): is it a WebDataset?")
         found = {c: [places[key].get(c) for key in samples if key in places] for c in columns}
-        return Manifest.of(self.path, [row for key, row in samples.items() if key in places], found, content=columns)
+        return Manifest.of(self.path, [row for key, row in samples.items() if key in places], found)
 
     def _index(self, shard: Path, samples: dict[str, dict[str, str]], places: dict[str, dict[str, ImageRef]]) -> None:
         """Add the members of ``shard``, which must not be compressed."""

@@ -7,7 +7,8 @@ import numpy as np
 from mvitac.data.checks.finding import Finding, judged, share, some
 from mvitac.data.checks.image_stats import ImageStats
 from mvitac.data.pack import Pack
-from mvitac.data.spec import STAMPS, Target, ValueTask, Window
+from mvitac.data.spec import Target, ValueTask, Window
+from mvitac.data.stamps import STAMPS, seconds
 from mvitac.data.windows import frames_of, places, recordings
 
 UNITS = ("N", "mN", "kN", "m", "cm", "mm", "um", "deg", "rad", "s", "ms", "kg", "g", "Nm", "Pa", "kPa")
@@ -137,13 +138,13 @@ def time_shift(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         for rows in touches:
             change[rows] += abs(light[rows] - light[rows[0]]).mean((1, 2))
     change[~pack.has(modality)] = np.nan
-    clock = next((pack.column(name).astype(float) for name in STAMPS if name in pack.table.column_names), None)
+    clock = next((seconds(pack.column(c).astype(str), c) for c in STAMPS if c in pack.table.column_names), None)
     notes, suspects = [], []
     for task in pack.spec.values:
         for t, target in enumerate(task.targets):
             found = [_shift(change, pack.values(task)[:, t], block) for rows in touches for block in _blocks(rows)]
             sign = np.sign(sum(curve[abs(curve).argmax()] for _, curve in found)) or 1.0
-            known = [(rows, sign * curve) for rows, curve in found if len(curve) and (sign * curve).max() >= CLEAR]
+            known = [(rows, sign * curve) for rows, curve in found if (sign * curve).max() >= CLEAR]
             late = [(rows, _lag(c)) for rows, c in known if c.max() - c[len(c) // 2] > GAIN]
             if not known:
                 continue

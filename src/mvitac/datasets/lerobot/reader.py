@@ -14,7 +14,6 @@ A sample is a pair: both cameras at the time of a table row. From a video, the f
 used, so cameras may have different rates. If it is farther away than ``tolerance``, the image is missing.
 """
 
-import math
 import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -29,8 +28,8 @@ from mvitac.data.video import frame_times
 from mvitac.datasets.table.clocks import nearest
 from mvitac.datasets.table.image_refs import Frame, ImageRef, ParquetCell
 from mvitac.datasets.table.manifest import Manifest, text_of
-from mvitac.datasets.table.table import RowsConfig
-from mvitac.registry import check_range, unknown
+from mvitac.datasets.table.table import RecordedConfig
+from mvitac.registry import unknown
 from mvitac.system.files import brief, parse_json, read_json
 
 FELT = re.compile(r"touch|tactile|gelsight|digit(?!al)|gel\b|finger", re.IGNORECASE)  # usual names of tactile cameras
@@ -40,7 +39,7 @@ SCALARS = {"float16", "float32", "float64", "int8", "int16", "int32", "int64", "
 
 
 @dataclass(frozen=True, kw_only=True)
-class LeRobotConfig(RowsConfig):
+class LeRobotConfig(RecordedConfig):
     """A LeRobotDataset (v3, v2) on disk: cameras as vision and touch, paired by time."""
 
     name: ClassVar[str] = "lerobot"
@@ -53,32 +52,23 @@ class LeRobotConfig(RowsConfig):
     """Camera key, or two to stack; default: those with touch, tactile, gelsight, digit or finger in their name."""
     tolerance: float = 0.04
     """Largest allowed time difference between a row and its video frame, in seconds."""
-    every: int = 1
-    """Use every n-th row of each episode, because consecutive rows are near-duplicates."""
+    every: int | None = 1
     group: str | None = "episode"
 
     @classmethod
     def reads(cls, path: Path) -> bool:
         return (path / "meta" / "info.json").is_file()
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_range(self, 1, math.inf, "every")
-
-    def unused(self) -> tuple[str, ...]:
-        return tuple(name for name in super().unused() if name != "tolerance")
-
     def manifest(self) -> Manifest:
         info = _info(self.path)
         cameras = [key for key, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
         names = choose(cameras, self.vision, self.touch, self.path)
         embedded = [key for key in names.values() if info["features"][key]["dtype"] == "image"]
-        rows, cells = _frames(self.path, info, embedded, self.every, self.vectors())
+        rows, cells = _frames(self.path, info, embedded, self.every or 1, self.vectors())
         found: dict[str, list[ImageRef | None]] = {}
         for column, key in names.items():
             found[column] = cells[key] if key in cells else self._in_videos(info, key, rows)
-        where = {c: [str(place).removeprefix(str(self.path)) for place in places] for c, places in found.items()}
-        return Manifest.of(self.path, rows, found, content=where)
+        return Manifest.of(self.path, rows, found)
 
     def _in_videos(self, info: dict[str, Any], key: str, rows: Sequence[dict[str, str]]) -> list[ImageRef | None]:
         """Return the frame of camera ``key`` at each row's time; None if no frame is near enough."""

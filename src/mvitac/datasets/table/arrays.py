@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from mvitac.data.images import MAX_PIXELS
-from mvitac.datasets.table.image_refs import ArrayRow, ImageRef, as_array, open_arrays
+from mvitac.datasets.table.image_refs import ArrayRow, ImageRef, entry, open_arrays
 from mvitac.datasets.table.manifest import Manifest, text_of
 
 USUAL = ("vision", "touch", "left", "right", "background")
@@ -63,7 +63,7 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
     if missing := [name for name in images if name not in found]:
         raise _no_images(path, missing, seen)
     rows = [{name: cell for name, cell in row.items() if name not in left_out} for row in rows]
-    return Manifest.of(path, rows, found, content=sorted(found), group="demo", left_out=left_out)
+    return Manifest.of(path, rows, found, group="demo", left_out=left_out)
 
 
 def _datasets(group: Any) -> dict[str, Any]:
@@ -123,8 +123,8 @@ def _holds_images(data: Any) -> bool:
     of_bytes = data.ndim == 1 and data.dtype.kind in "SVO"
     if not (of_bytes or (data.ndim == 2 and data.dtype == np.uint8)) or not data.shape[0]:
         return False
-    first = as_array(data[0])
-    return bytes(first[:4] if isinstance(first, bytes) else np.asarray(first).ravel()[:4].astype(np.uint8))[:2] in MAGIC
+    first = entry(data, 0)
+    return isinstance(first, bytes) and first.startswith(MAGIC)
 
 
 def _topmost(group: str, image: Any, rows: set[tuple[Any, ...]]) -> str:

@@ -9,18 +9,16 @@ import os
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 
-from mvitac.data.spec import STAMPS
+from mvitac.data.stamps import STAMPS, seconds
 from mvitac.data.video import frame_times
+from mvitac.datasets.table.columns import with_elements
 from mvitac.datasets.table.image_refs import Frame, ImageRef
-from mvitac.datasets.table.manifest import Manifest, number_of, read_manifest, text_of
+from mvitac.datasets.table.manifest import READERS, Manifest, Row, number_of, read_manifest, text_of
 from mvitac.system.files import digest
-
-UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))  # stamps since 1970 above so much are in ns, us, ms
 
 
 def nearest(times: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -33,32 +31,47 @@ def nearest(times: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return at, np.abs(times[at] - wanted)
 
 
-def seconds(cells: Sequence[str]) -> np.ndarray:
-    """Return stamps [N] in seconds, NaN where there is none: s, or ms, us or ns since 1970, or dates as in ISO 8601."""
+def times_of(video: Path) -> np.ndarray:
+    """Return the times [N] of the frames in seconds: of the file VIDEO_timestamps.csv or .txt, else of the container."""
+    times = frame_times(video)
+    beside = [video.with_name(f"{video.stem}_timestamps{suffix}") for suffix in (".txt", *READERS)]
+    file = next((file for file in beside if file.is_file()), None)
+    if file is None:
+        return times
+    if file.suffix == ".txt":
+        stamps = seconds([line.strip() for line in file.read_text().splitlines() if line.strip()], file)
+    else:
+        table = read_manifest(file)
+        usual = next((name for name in STAMPS if name in table.columns), STAMPS[0])
+        column = table.columns[0] if len(table.columns) == 1 else usual
+        table.check(column)
+        stamps = seconds(table.filled(column, "time"), file)
+    if len(stamps) != len(times):
+        raise ValueError(f"{file} has {len(stamps)} times, {video.name} has {len(times)} frames")
+    if (np.diff(stamps) < 0).any():
+        raise ValueError(f"{file}: time {np.argmax(np.diff(stamps) < 0) + 2} is before the one above it")
+    return stamps
 
-    def one(cell: str) -> float:
-        number = number_of(cell) if cell else math.nan
-        return datetime.fromisoformat(cell).timestamp() if number is None else number
 
-    stamps = np.array([one(cell) for cell in cells], float)
-    size = np.nanmax(np.abs(stamps), initial=0)
-    return stamps * next((scale for above, scale in UNITS if size > above), 1.0)
+def row_times(table: Manifest, column: str, refs: Sequence[ImageRef | None]) -> tuple[np.ndarray, list[str]]:
+    """Return when the rows were seen [N], in seconds, and the recording of each.
 
-
-def row_times(table: Manifest, column: str, refs: Sequence[ImageRef | None]) -> np.ndarray:
-    """Return when the rows were seen [N], in seconds: by ``column``, else one of ``STAMPS``, else as their videos say."""
+    The time is in ``column``, else in one of ``STAMPS``; else videos say it, and then each is a recording.
+    """
+    recordings = [row.get(table.group or "", "") for row in table.rows]
     if name := next((name for name in (column, *STAMPS) if name in table.columns), None):
-        return seconds(table.filled(name, "time"))
+        return seconds(table.filled(name, "time"), f"{table.path}, column {name}"), recordings
     known: dict[str, np.ndarray] = {}
     times = np.full(len(refs), np.nan)
     for i, ref in enumerate(refs):
         if not isinstance(ref, Frame):
             raise ValueError(f"{table.at(i)} has no time: give the table a column {column!r} or {' or '.join(STAMPS)}")
         if ref.path not in known:
-            known[ref.path] = frame_times(ref.path)
+            known[ref.path] = times_of(Path(ref.path))
         if ref.index < len(known[ref.path]):
             times[i] = known[ref.path][ref.index]
-    return times
+        recordings[i] = ref.path
+    return times, recordings
 
 
 def join(
@@ -85,42 +98,48 @@ def join(
     shown = next((column for column in images if column in table.columns), None)
     refs: list[ImageRef | None] = table.refs(shown) if shown else [None] * len(table.rows)
     for text in logs:
-        name, _, rest = text.rpartition(":")
-        if not name or not rest:
-            raise ValueError(f"log {text!r}: write FILE:COLUMN, where COLUMN has the time stamps")
-        column, shift = rest, 0.0
-        if (found := re.fullmatch(r"(.+?)([+-]\d*\.?\d+)", rest)) and found[2]:
-            column, shift = found[1], float(found[2])
-        times = row_times(table, column, refs)
-        made: list[dict[str, str]] = [{} for _ in table.rows]
+        name, column, shift = _parsed(text)
+        times, recordings = row_times(table, column, refs)
+        made: list[Row] = [{} for _ in table.rows]
         gap = 0.0
         for file, at in _files(table, name, refs).items():
-            log = read_manifest(file)
+            _check_apart(file, times[at], [recordings[i] for i in at])
+            log = with_elements(read_manifest(file), numbers)
             log.check(column)
-            stamps = seconds([row[column] for row in log.rows]) + shift
-            order = np.argsort(stamps, kind="stable")[: np.isfinite(stamps).sum()]  # NaN is last
-            cells, largest = joined(log, order, stamps[order], times[at], (numbers if linear else ()), tolerance)
+            stamps = seconds(log.filled(column, "time"), f"{file}, column {column}") + shift
+            cells, largest = joined(log, stamps, times[at], (numbers if linear else ()), tolerance)
             gap = max(gap, largest)
-            for i, row in zip(at, cells, strict=True):
-                made[i] = {c: cell for c, cell in row.items() if c != column}
-                for c in made[i].keys() & set(images):
-                    made[i][c] = os.path.relpath(file.parent / made[i][c], table.root)
             if not any(cells):
-                spans = [f"{t[0]:.3f} to {t[-1]:.3f} s" for t in (np.sort(times[at]), stamps[order])]
+                spans = [f"{np.nanmin(t):.3f} to {np.nanmax(t):.3f} s" for t in (times[at], stamps)]
                 raise ValueError(
                     f"{file} has no time of the images, {spans[0]}, but {spans[1]}: {text}+SECONDS shifts it"
                 )
+            for i, row in zip(at, cells, strict=True):
+                made[i] = {c: cell for c, cell in row.items() if c != column}
+                for c in [c for c in images if made[i].get(c)]:
+                    made[i][c] = os.path.relpath(file.parent / made[i][c], table.root)
         names = dict.fromkeys(c for row in made for c in row)
         if twice := names.keys() & set(table.columns):
             raise ValueError(f"{table.path} and {name} both have a column {min(twice)!r}: rename one")
         there = [bool(row) for row in made]
         lost = f"; {there.count(False)} of {len(there)} rows are not within {tolerance:g} s of it and left out"
-        note = f"{name} joined by {rest}, its largest gap is {gap:.3g} s{lost * (not all(there))}"
+        note = (
+            f"{name} joined by {text.removeprefix(f'{name}:')}, its largest gap is {gap:.3g} s{lost * (not all(there))}"
+        )
         rows = [{**row, **{c: more.get(c, "") for c in names}} for row, more in zip(table.rows, made, strict=True)]
         table = replace(table, rows=rows, digest=digest([table.digest, made]), notes=(*table.notes, note))
         table = table.kept(there, "")
         refs = [ref for ref, kept in zip(refs, there, strict=True) if kept]
     return table
+
+
+def _parsed(text: str) -> tuple[str, str, float]:
+    """Return file, column and shift in seconds of ``FILE:COLUMN-0.35``."""
+    name, _, rest = text.rpartition(":")
+    if not name or not rest:
+        raise ValueError(f"log {text!r}: write FILE:COLUMN, where COLUMN has the time stamps")
+    found = re.fullmatch(r"(.+?)([+-]\d*\.?\d+)", rest)
+    return (name, found[1], float(found[2])) if found else (name, rest, 0.0)
 
 
 def _files(table: Manifest, name: str, refs: Sequence[ImageRef | None]) -> dict[Path, list[int]]:
@@ -134,22 +153,49 @@ def _files(table: Manifest, name: str, refs: Sequence[ImageRef | None]) -> dict[
     return files
 
 
-def joined(
-    log: Manifest, order: np.ndarray, stamps: np.ndarray, times: np.ndarray, smooth: Collection[str], tolerance: float
-) -> tuple[list[dict[str, str]], float]:
-    """Return the cells of ``log`` at ``times`` [M], {} where it has none, and its largest gap in seconds.
+def _check_apart(file: Path, times: np.ndarray, recordings: Sequence[str]) -> None:
+    """Raise ValueError if recordings that each begin at 0 s share the log ``file``, whose values fit only one of them."""
+    names = np.array(recordings)[np.argsort(times, kind="stable")]
+    if np.nanmax(times, initial=0) < 1e9 and (names[1:] != names[:-1]).sum() >= len({*recordings}):
+        raise ValueError(
+            f"{file} would be the log of {len({*recordings})} recordings at the same times: give each its own, beside"
+            " its video, or stamps since 1970"
+        )
 
-    ``order`` [N] are its rows by time, ``stamps`` [N] their times.
+
+def joined(
+    log: Manifest, stamps: np.ndarray, times: np.ndarray, smooth: Collection[str], tolerance: float
+) -> tuple[list[Row], float]:
+    """Return the cells of ``log``, whose rows are of ``stamps`` [N], at ``times`` [M], and its largest gap in seconds.
+
+    Cells are {} where there is no measurement within ``tolerance``. Columns of ``smooth`` are interpolated, others nearest.
     """
-    inside = (stamps >= times.min() - tolerance) & (stamps <= times.max() + tolerance)
-    gap = float(np.diff(stamps[inside]).max(initial=0))
+    order = np.argsort(stamps, kind="stable")
+    stamps = stamps[order]
     at, away = nearest(stamps, times)
     good = away <= tolerance + 1e-9
-    columns = {name: [log.rows[row][name] for row in order[at]] if len(order) else [] for name in log.rows[0]}
+    if not good.any():
+        return [{} for _ in times], 0.0
+    near = (stamps >= np.nanmin(times) - tolerance) & (stamps <= np.nanmax(times) + tolerance)
+    gaps = np.diff(stamps[near], append=stamps[near][-1])
+    columns = {name: [log.rows[row][name] for row in order[at]] for name in log.rows[0]}
     for name in columns.keys() & set(smooth):
-        after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
+        known = np.array([_number(log, row, name) for row in order.tolist()])
+        after = np.clip(np.searchsorted(stamps, times), min(1, len(stamps) - 1), len(stamps) - 1)
         ends = np.abs(stamps[[after - 1, after]] - times).max(0)
-        known = np.array([math.nan if (value := number_of(log.rows[row][name])) is None else value for row in order])
         good &= ((ends <= tolerance + 1e-9) & (times >= stamps[0]) & (times <= stamps[-1])) | (away == 0)
         columns[name] = [text_of(float(f"{value:.9g}")) for value in np.interp(times, stamps, known)]
-    return [{name: cells[i] for name, cells in columns.items()} if good[i] else {} for i in range(len(times))], gap
+    step = np.median(np.diff(stamps, append=stamps[-1]))
+    if columns.keys() & set(smooth) and good.mean() < 0.5 and step > 2 * tolerance:
+        far = f"{log.path}: stamps are {step:g} s apart"
+        raise ValueError(f"{far}, more than --data.tolerance {tolerance:g} on both sides: are they seconds?")
+    cells = [{name: texts[i] for name, texts in columns.items()} if good[i] else {} for i in range(len(times))]
+    return cells, float(gaps.max())
+
+
+def _number(log: Manifest, i: int, name: str) -> float:
+    cell = log.rows[i][name]
+    value = number_of(cell) if cell else math.nan
+    if value is None:
+        raise ValueError(f"{log.at(i)}: {name} is {cell!r}, which cannot be interpolated: --data.interpolate nearest")
+    return value

@@ -3,18 +3,21 @@
 Frames have the columns recording (their group), frame and, where it is known, time in seconds and minute.
 """
 
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from mvitac.data.images import IMAGES
 from mvitac.data.pack_table import SPLITS
-from mvitac.data.spec import STAMPS
-from mvitac.data.video import VIDEOS, frame_times
-from mvitac.datasets.table.clocks import nearest, seconds
+from mvitac.data.stamps import seconds
+from mvitac.data.video import VIDEOS
+from mvitac.datasets.table.clocks import nearest, times_of
 from mvitac.datasets.table.image_refs import Frame, ImageRef
-from mvitac.datasets.table.manifest import READERS, Manifest, Row, number_of, read_manifest
+from mvitac.datasets.table.manifest import Manifest, Row, number_of
+from mvitac.system.files import digest
 
 CAMERAS = ("touch", "left", "right", "vision")
 EVERY = 5
@@ -54,10 +57,12 @@ def _split_rows(root: Path, split: str, plain: str, every: int) -> list[Row]:
     flat = [key for key in keys if "/" not in key]
     if flat and len(flat) < len(keys):
         raise ValueError(f"{base}: {flat[0]}.* is not in a class folder: put it in one, named by its class")
-    numbers = [number_of(key) for key in flat]
-    if flat and None not in numbers:  # 2 comes before 10
-        keys = [key for _, key in sorted(zip(numbers, flat, strict=True))]
-    times = seconds(keys) if flat and None not in numbers else np.zeros(1)
+    numbered = bool(flat) and all(number_of(key) is not None for key in flat)
+    if flat:  # 2 comes before 10, and 2.25 before 2.5
+        keys.sort(
+            key=float if numbered else lambda key: [int(n) if n.isdecimal() else n for n in re.split(r"(\d+)", key)]
+        )
+    times = seconds(keys, base) if numbered else np.zeros(1)
     stamped = times.min() > 1e9  # since 1970; smaller numbers count the images
     rows = []
     for i, key in enumerate(keys):
@@ -117,7 +122,7 @@ def list_videos(path: Path, names: Sequence[str], plain: str, every: int | None,
     images: dict[str, list[ImageRef | None]] = {camera: [] for camera in cameras}
     away, alone = 0.0, 0
     for recording, files in sorted(recordings.items()):
-        times = {camera: _times(file) for camera, file in files.items()}
+        times = {camera: times_of(file) for camera, file in files.items()}
         own = times[next(camera for camera in cameras if camera in files)]
         shown = np.arange(0, len(own), every or EVERY)
         at = {camera: nearest(each, own[shown]) for camera, each in times.items()}
@@ -131,26 +136,8 @@ def list_videos(path: Path, names: Sequence[str], plain: str, every: int | None,
                 images[camera].append(ref)
     note = f"{' and '.join(cameras)} are paired by time, at most {away:.3g} s apart"
     note += f"; {alone} frames without a partner within {tolerance:g} s are left out" * bool(alone)
-    where = {camera: [str(ref).removeprefix(str(path)) for ref in refs] for camera, refs in images.items()}
     notes = (note,) if len(cameras) > 1 else ()
-    return Manifest.of(path, rows, images, content=where, group="recording", notes=notes)
-
-
-def _times(video: Path) -> np.ndarray:
-    """Return the times [N] of the frames in seconds: of the file VIDEO_timestamps.csv or .txt, else of the container."""
-    times = frame_times(video)
-    beside = [video.with_name(f"{video.stem}_timestamps{suffix}") for suffix in (".txt", *READERS)]
-    file = next((file for file in beside if file.is_file()), None)
-    if file is None:
-        return times
-    if file.suffix == ".txt":
-        stamps = seconds([line.strip() for line in file.read_text().splitlines() if line.strip()])
-    else:
-        table = read_manifest(file)
-        stamps = seconds(table.filled(next((c for c in STAMPS if c in table.columns), table.columns[0]), "time"))
-    if len(stamps) != len(times):
-        raise ValueError(f"{file} has {len(stamps)} times, {video.name} has {len(times)} frames")
-    return stamps
+    return Manifest.of(path, rows, images, group="recording", notes=notes)
 
 
 def recording_row(recording: str, frame: int, time: float | None) -> Row:
@@ -164,11 +151,13 @@ def to_train(table: Manifest) -> Manifest:
         return table
     rows: list[Row] = []
     names = list(dict.fromkeys(row["recording"] for row in table.rows))
+    whole = len(names) >= VAL
     for number, name in enumerate(names):
         own = [row for row in table.rows if row["recording"] == name]
-        whole, last = len(names) >= VAL, len(own) - max(1, len(own) // VAL)
+        last = len(own) - max(1, len(own) // VAL)
         for i, row in enumerate(own):
             val = number % VAL == VAL - 1 if whole else i >= last
             group = f"{name}, its end" if val and not whole else name
             rows.append({**row, "recording": group, "split": "val" if val else "train"})
-    return table.of(table.path, rows, table.images, content=table.digest, group="recording", notes=table.notes)
+    notes = (*table.notes, *(("val is the end of each recording, so it is much like train",) * (not whole)))
+    return replace(table, rows=rows, digest=digest([table.digest, rows]), notes=notes)

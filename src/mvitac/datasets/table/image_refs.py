@@ -1,7 +1,7 @@
 """References to images: a file, a frame of a video, a member of a tar, a cell of a parquet table, an array.
 
 References with the same container (a video, a row group) are read together in one pass. Another format is one more
-class here: its ``container``, how it is ``opened``, and one ``image`` of it.
+class here: its ``container``, how it is ``opened``, and what is ``stored`` there.
 """
 
 import io
@@ -55,11 +55,12 @@ class ImageRef:
         """Open the container; ValueError or OSError if that fails."""
         yield None
 
-    def image(self, container: Any) -> Image.Image:
-        """Read the image from the opened container as RGB; ValueError or OSError if it is damaged."""
-        if self.path.lower().endswith(".npy"):
-            return picture(np.load(self.path, allow_pickle=False), self)
-        return decode(self.path, span=self.span)
+    def stored(self, container: Any) -> str | bytes | np.ndarray:
+        """Read from the opened container the path or the bytes of an image file, or numbers [H, W] or [H, W, 1 to 3].
+
+        References of one container are asked for in ascending order. ValueError or OSError if it is damaged.
+        """
+        return np.load(self.path, allow_pickle=False) if self.path.lower().endswith(".npy") else self.path
 
     @staticmethod
     def read(refs: "Sequence[ImageRef]", lost: Damage) -> "Iterator[tuple[ImageRef, Image.Image]]":
@@ -67,7 +68,7 @@ class ImageRef:
         with refs[0].opened() as container:
             for ref in refs:
                 try:
-                    found = ref.image(container)
+                    found = picture(ref.stored(container), ref)
                 except (ValueError, OSError) as error:
                     lost[ref] = str(error)
                 else:
@@ -108,10 +109,10 @@ class TarMember(ImageRef):
     def within(self) -> tuple[int, ...]:
         return self.offset, self.size
 
-    def image(self, container: Any) -> Image.Image:
+    def stored(self, container: Any) -> bytes:
         with open(self.path, "rb") as file:
             file.seek(self.offset)
-            return decode(io.BytesIO(file.read(self.size)), str(self))
+            return file.read(self.size)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -136,7 +137,7 @@ class ParquetCell(ImageRef):
             raise ValueError(f"{self.path} cannot be read ({brief(error)})") from None
         yield values
 
-    def image(self, container: pa.ChunkedArray) -> Image.Image:
+    def stored(self, container: pa.ChunkedArray) -> bytes:
         value = container[self.row].as_py()
         if isinstance(value, dict):
             folder = Path(self.path).resolve().parent
@@ -145,17 +146,23 @@ class ParquetCell(ImageRef):
             value = value.get("bytes") or (beside.read_bytes() if inside else None)
         if not value:
             raise ValueError(f"{self} holds no image")
-        return decode(io.BytesIO(value), str(self))
+        return value
 
 
-def picture(pixels: Any, ref: ImageRef) -> Image.Image:
-    """Return an array as RGB: [H, W], or [H, W, 1 to 3] as numbers, or the bytes [B] of an image file."""
-    if isinstance(pixels, bytes) or pixels.ndim < 2:
-        return decode(io.BytesIO(pixels if isinstance(pixels, bytes) else pixels.tobytes()), str(ref))
-    if pixels.ndim > 3 or pixels.shape[2:] not in ((), (1,), (2,), (3,)):
+def _usual(kind: np.dtype) -> tuple[float, float]:
+    """Return what is black and white in numbers of more than 8 bits, or in 8 bits that are stored as longer numbers."""
+    return (0.0, 1.0) if kind.kind == "f" else (0, 65535) if kind.kind == "u" and kind.itemsize == 2 else (0, 255)
+
+
+def picture(found: str | bytes | np.ndarray, ref: ImageRef) -> Image.Image:
+    """Return what is ``stored`` of ``ref`` as RGB."""
+    if not isinstance(found, np.ndarray):
+        return decode(found if isinstance(found, str) else io.BytesIO(found), str(ref), ref.span)
+    pixels = found
+    if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (1,), (2,), (3,)):
         raise ValueError(f"{ref} has the shape {list(pixels.shape)}: give height, width and 1 to 3 channels")
     if pixels.dtype != np.uint8 or ref.span:
-        pixels = to_gray(pixels, ref.span or ((0, 65535) if pixels.dtype.kind in "iu" else (0.0, 1.0)), bool(ref.span))
+        pixels = to_gray(pixels, ref.span or _usual(pixels.dtype), bool(ref.span))
     pixels = pixels.reshape(*pixels.shape[:2], -1)
     if pixels.shape[2] == 2:  # such as a field of motion
         pixels = np.concatenate([pixels, np.zeros_like(pixels[:, :, :1])], axis=2)
@@ -180,7 +187,8 @@ def open_arrays(path: str | Path) -> Iterator[Any]:
             import zarr.storage
 
             zipped = str(path).lower().endswith(".zip")
-            yield zarr.open_group(zarr.storage.ZipStore(path, mode="r") if zipped else str(path), mode="r")
+            with zarr.storage.ZipStore(path, mode="r") if zipped else zarr.storage.LocalStore(path) as store:
+                yield zarr.open_group(store, mode="r")
     except ModuleNotFoundError:
         raise ValueError(f"{path} needs zarr: pip install 'mvitac[zarr]'") from None
     except (OSError, KeyError, RuntimeError, TypeError, UnicodeDecodeError, BadZipFile) as error:
@@ -208,33 +216,28 @@ class ArrayRow(ImageRef):
         with open_arrays(self.path) as file:
             yield file[self.dataset]
 
-    def image(self, container: Any) -> Image.Image:
+    def stored(self, container: Any) -> bytes | np.ndarray:
         try:
-            found = container[self.index]
+            return entry(container, self.index)
         except (OSError, RuntimeError, IndexError) as error:
             raise ValueError(f"{self} cannot be read ({brief(error)})") from None
-        return picture(found if isinstance(found, bytes) else as_array(found), self)
 
 
-def is_deep(ref: ImageRef) -> bool:
-    """Whether an image has more than 8 bits, so that it is scaled."""
-    if isinstance(ref, ArrayRow):
-        with ref.opened() as data:
-            return data.dtype != np.uint8 and data.ndim == 4
-    suffix = Path(ref.path).suffix.lower()
-    if suffix == ".npy":
-        return np.load(ref.path, mmap_mode="r").dtype != np.uint8
-    if type(ref) is not ImageRef or suffix not in (".png", ".tif", ".tiff", ".pgm"):
-        return False
-    with suppress(OSError), Image.open(ref.path) as image:
-        return image.mode[0] in "IF"
-    return False
+def entry(data: Any, index: int) -> Any:
+    """Return a row of a dataset: numbers [H, W, ...], or bytes where it is a file (text, opaque, or numbers [B])."""
+    array = np.asarray(data[index])
+    return array if array.ndim > 1 else array.tobytes() if array.ndim else array.tolist()
 
 
-def as_array(found: Any) -> Any:
-    """Return what an array of bytes holds as bytes, and any other as an array of numbers."""
-    array = np.asarray(found)
-    return array.tolist() if array.dtype.kind in "SVO" and array.ndim == 0 else array
+def span_of(ref: ImageRef) -> tuple[float, ...]:
+    """Return the numbers that become black and white of an image of more than 8 bits; () of others, and of damaged ones."""
+    with suppress(ValueError, OSError), ref.opened() as container:
+        found = ref.stored(container)
+        if isinstance(found, np.ndarray):
+            return () if found.dtype == np.uint8 else ref.span or _usual(found.dtype)
+        with Image.open(found if isinstance(found, str) else io.BytesIO(found)) as image:
+            return () if image.mode[0] not in "IF" else ref.span or (0, 65535)
+    return ()
 
 
 def read_all(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:

@@ -55,8 +55,6 @@ class Manifest:
         path: Path,
         rows: Sequence[Row],
         images: dict[str, list[ImageRef | None]] | None = None,
-        *,
-        content: Any = None,
         **known: Any,
     ) -> "Manifest":
         """Return the table of ``rows`` that a reader made from ``path``; cells that a row lacks are empty.
@@ -65,14 +63,14 @@ class Manifest:
             path: What was read.
             rows: Column -> text, for each row. ``text_of`` makes texts of other values.
             images: Image column -> reference per row, or None; other image columns hold paths.
-            content: What determines ``images`` beside the rows and the sizes of the files.
             known: Other fields.
         """
         if not rows:
             raise ValueError(f"{path} holds no rows: is it the right one, and whole?")
         names = dict.fromkeys(name for row in rows for name in row)
         rows = [{name: row.get(name, "") for name in names} for row in rows]
-        known.setdefault("digest", digest(rows if content is None else [rows, content]))
+        where = {c: [str(ref).removeprefix(str(path)) for ref in refs] for c, refs in (images or {}).items()}
+        known.setdefault("digest", digest([rows, where] if where else rows))
         return cls(path, rows, numbers=range(1, len(rows) + 1), images=images or {}, **known)
 
     @property

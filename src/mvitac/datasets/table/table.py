@@ -21,7 +21,7 @@ from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.datasets.table import clocks, columns, image_columns, splits
 from mvitac.datasets.table.columns import Condition, all_hold, value_task
 from mvitac.datasets.table.image_columns import Background
-from mvitac.datasets.table.image_refs import is_deep
+from mvitac.datasets.table.image_refs import span_of
 from mvitac.datasets.table.manifest import Manifest, number_of
 from mvitac.datasets.table.read_rows import Row, bundles, read_rows
 from mvitac.datasets.table.splits import BY_GROUP
@@ -187,6 +187,23 @@ class RowsConfig(DatasetConfig, ABC):
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class RecordedConfig(RowsConfig, ABC):
+    """Options of tables whose rows may be frames of recordings, which follow each other closely."""
+
+    every: int | None = None
+    """Use every n-th frame of a recording; by default all images, every row of an episode, and every fifth frame of a
+    video or image of a bag. Rows of a table are all used."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.every is not None:
+            check_range(self, 1, math.inf, "every")
+
+    def unused(self) -> tuple[str, ...]:
+        return (*super().unused(), *(("every",) * (self.every is None)))
+
+
 class Rows(Source):
     """Reads a table. An item is one row, or the rows of one video (one row group, ...), which are read in one pass."""
 
@@ -251,9 +268,8 @@ class Rows(Source):
         notes = [f"{text} is the part of the images that is used, squeezed to a square" for text in self._config.crop]
         for column in self._images:
             ref = next((ref for ref in table.images[column] if ref), None)
-            if ref and is_deep(ref):
-                low, high = ref.span or ("0", "65535, or 1 of floats,")
-                notes.append(f"{column} has more than 8 bits: {low} is black, {high} white (--range {column}=LOW:HIGH)")
+            if ref and (span := span_of(ref)):
+                notes.append("{} has more than 8 bits: {:g} is black, {:g} white".format(column, *span))
         return tuple(notes)
 
     def _joined(self, table: Manifest) -> Manifest:
