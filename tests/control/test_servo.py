@@ -78,6 +78,19 @@ def test_true_pose_stays_on_and_no_touch_does_not(kind: str) -> None:
         assert (np.mean(errors) < 0.15) == known
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_contact_is_lost_beyond_the_limit_and_stays_lost(kind: str) -> None:
+    for part in (0.8, 1.3):
+        episode = Episode.begin(0, kind, 1)
+        limit = episode.task.limit
+        episode.move(episode.task.target + part * limit * (np.arange(len(limit)) == 0) - episode.pose)
+        there, mm, deg = episode.state, *episode.error()
+        assert episode.lost == (part > 1) and (mm == limit[0]) == (part > 1)
+        episode.move(episode.task.target - episode.pose)
+        assert (episode.state is there) == episode.lost == (part > 1)
+        assert not episode.lost or episode.error() == (mm, deg) == (limit[0], np.hypot.reduce(limit[1:]))
+
+
 def test_pictures_show_the_pose_and_repeat() -> None:
     one, other = Episode.begin(0, "straight", 2), Episode.begin(0, "straight", 2, new=True)
     assert np.array_equal(one.touch(), one.touch())
