@@ -1,6 +1,7 @@
 """Following edges and surfaces: poses and corrections agree, results repeat, and changed results are refused."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,11 @@ import pytest
 from mvitac.bench.encoder import About
 from mvitac.bench.result import VOLATILE
 from mvitac.cli.main import main
-from mvitac.control import result, suite
+from mvitac.control import result
+from mvitac.control.result import find_suite
 from mvitac.control.servo import TASKS, Edge, Episode, Surface, presses, task_of, textures
-from mvitac.control.servo_rows import Servo
-from mvitac.control.suite import Condition, find_suite
+from mvitac.control.servo_rows import Condition, Servo
+from mvitac.control.suite import Row
 from mvitac.system.files import digest
 
 RANDOM = "external:timm/test_resnet,weights=random,size=32,seed={}"
@@ -22,26 +24,25 @@ KINDS = [kind for task in TASKS.values() for kind in task.kinds]
 
 
 @pytest.fixture(scope="module")
-def small() -> suite.ServoSuite:
+def small() -> Servo:
     few: Any = {"shapes": 2, "steps": 6, "settle": 2, "fit_shapes": 6, "fit_presses": 4, "fit_val": 2, "train_steps": 2}
     texts = tuple(map(RANDOM.format, range(2)))
     late = (Condition(name="known sensor"), Condition(name="late", latency_ms=50, new_sensor=True))
-    return replace(find_suite("servo-v1"), name="small-v1", **few, untrained=texts, conditions=late)
+    return replace(find_suite("servo-v1"), name="small-v1", **few, untrained=texts, conditions=late)  # type: ignore[return-value]
 
 
 @pytest.fixture(scope="module")
-def done(small: suite.ServoSuite, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def done(small: Servo, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("servo")
     return result.run_suite([RANDOM.format(5)], small, out, About(name="five"))
 
 
 @pytest.fixture(autouse=True)
-def known(monkeypatch: pytest.MonkeyPatch, small: suite.ServoSuite, request: pytest.FixtureRequest) -> None:
+def known(monkeypatch: pytest.MonkeyPatch, small: Servo) -> None:
     """The small suite is one of this version."""
-    find = suite.find_suite
-    for module in (result, suite):
-        monkeypatch.setattr(module, "find_suite", lambda name: small if name == small.name else find(name))
-    monkeypatch.setattr(result, "shipped", lambda: [small.name])
+    find = result.find_suite
+    monkeypatch.setattr(result, "find_suite", lambda name: small if name == small.name else find(name))
+    monkeypatch.setattr(result, "shipped", lambda: [small.name, "servo-v1"])
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -109,16 +110,18 @@ def test_presses_cover_what_probes_need() -> None:
 
 
 def test_a_result_repeats_and_says_how_good_each_row_is(
-    done: Path, small: suite.ServoSuite, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    done: Path, small: Servo, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    value = result.read_control(done)
-    again = result.read_control(result.run_suite([RANDOM.format(5)], small, tmp_path, About(name="five")))
+    _, value = result.read_control(done)
+    _, again = result.read_control(result.run_suite([RANDOM.format(5)], small, tmp_path, About(name="five")))
     assert value["digest"] == again["digest"]
-    scores = result.scores(value)
+    scores = result.scores([value])
     assert {"five", "true pose", "no touch", "pixels", "untrained", "end to end", "touch shuffled"} <= scores.keys()
-    for kind in KINDS:
-        assert scores["true pose"][kind, "all", "mm"].mean() < scores["no touch"][kind, "all", "mm"].mean()
-    assert scores["untrained"]["surface", "late", "mm"].shape == (2, 2)
+    for key in scores["pixels"]:
+        assert sum(scores["true pose"][key][0]["mm"]) < sum(scores["no touch"][key][0]["mm"])
+    assert [cell["seed"] for cell in scores["untrained"]["surface", "late"]] == [0, 1]
+    with pytest.raises(ValueError, match="is the result of other weights"):
+        result.run_suite([RANDOM.format(6)], small, tmp_path, About(name="five"))
     assert main(["bench", "check", str(done)]) == 0
     assert main(["bench", "board", str(done), "--out", str(tmp_path / "board.html")]) == 0
     assert "true pose" in (tmp_path / "board.html").read_text()
@@ -138,12 +141,15 @@ def _late(value: dict[str, Any]) -> None:
     value["suite_digest"] = digest(value["suite"])
 
 
-CHANGES = {
+CHANGES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "no episodes give": _better,
     "other sums here": _true,
     "the suite asks for": lambda value: value["rows"].pop(3),
     "not of this version's": _late,
     "other tasks": lambda value: value["rows"][0]["cells"].pop(),
+    "this version reads 1": lambda value: value.update(format_version=2),
+    "the name of a control": lambda value: value["encoder"].update(name="true pose"),
+    "weights for seeds": lambda value: value["encoder"]["weights"].append("0"),
 }
 
 
@@ -153,7 +159,7 @@ def test_changed_results_are_refused(done: Path, tmp_path: Path, why: str) -> No
     CHANGES[why](value)
     path = tmp_path / "changed.json"
     path.write_text(json.dumps(value))
-    with pytest.raises(ValueError, match="does not match its digest"):
+    with pytest.raises(ValueError, match=r"does not match its digest|this version reads 1"):
         result.read_control(path)
     value["digest"] = digest({key: part for key, part in value.items() if key not in VOLATILE})
     path.write_text(json.dumps(value))
@@ -161,10 +167,23 @@ def test_changed_results_are_refused(done: Path, tmp_path: Path, why: str) -> No
         result.read_control(path)
 
 
-def test_latency_and_shuffling_hurt(small: suite.ServoSuite) -> None:
+def test_a_star_is_over_shapes_and_seeds(small: Servo) -> None:
+    """Untrained trunks that differ among themselves as much as from the row are no evidence, however alike their shapes."""
+
+    def marked(untrained: tuple[float, float]) -> bool:
+        lines = [("pixels", None, 1.0), *(("untrained", seed, mm) for seed, mm in enumerate(untrained))]
+        cells = {"task": "straight", "condition": "late", "n": [4.0] * 8, "deg": [0.0] * 8, "lost": [0.0] * 8}
+        rows = [{"source": s, "seed": seed, "cells": [{**cells, "mm": [4 * mm] * 8}]} for s, seed, mm in lines]
+        known = result.scores([{"rows": rows, "encoder": {"name": "mine"}}])
+        return result._cell(small, known, "pixels", ("straight", "late")).endswith("*")
+
+    assert marked((2.0, 2.02)) and not marked((2.0, 1.2))
+
+
+def test_latency_hurts(small: Servo) -> None:
     long = replace(small, steps=40, settle=10, shapes=6, conditions=(Condition(name="a"),))
     late = replace(long, conditions=(Condition(name="a", latency_ms=150),))
-    mm = [np.mean(Servo(each).run(None)[2]["mm"]) for each in (long, late)]
+    mm = [np.mean(each.score(Row("true pose", None, None))[2]["mm"]) for each in (long, late)]
     assert mm[1] > 1.5 * mm[0]
 
 

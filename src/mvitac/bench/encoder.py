@@ -1,7 +1,7 @@
 """The encoder of a bench: load it, say what it is, score it, write its result."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Any
 from tyro.conf import Fixed
 
 from mvitac.bench.external import ExternalModel
-from mvitac.bench.result import GUESS, read_result, sign, write_result
+from mvitac.bench.result import FORM, GUESS, read_signed, sign, write_result
 from mvitac.bench.score import Entry, score_suite
 from mvitac.bench.suite import Suite
 from mvitac.deploy.artifact import load
@@ -52,21 +52,41 @@ def run_bench(places: Sequence[str], suite: Suite, out: Path, root: Path | None,
     ``places`` are its seeds: folders of runs or artifacts, or "external:...". ``root`` is the folder of real data, if
     any.
     """
+
+    def score(models: Sequence[Model], encoder: dict[str, Any]) -> dict[str, Any]:
+        entry = Entry(models, places, encoder["name"], encoder["trained_on"])
+        blocks = list(score_suite(entry, suite, root, out / "parts", digest(encoder)))
+        if all("not_run" in block for block in blocks):
+            raise ValueError(f"{entry.name} was scored on no task of {suite.name}: {blocks[0]['not_run']}")
+        return {"blocks": blocks}
+
+    return measure(places, suite, out, about, score)
+
+
+def measure(
+    places: Sequence[str],
+    suite: Any,
+    out: Path,
+    about: About,
+    score: Callable[[Sequence[Model], dict[str, Any]], dict[str, Any]],
+    form: tuple[str, int] = FORM,
+) -> Path:
+    """Load an encoder (its seeds), let ``score`` measure it, and write <out>/<suite>-<name>.json.
+
+    ``score`` gets the models and the encoder as ``describe`` says it, and returns the fields of its own in the result.
+    """
     models = [load(place) for place in places]
     encoder = describe(models, places, about)
     path = out / f"{suite.name}-{slug(encoder['name'])}.json"
     check_place(path)
-    if path.exists() and (old := read_result(path)["encoder"]["weights"]) != encoder["weights"]:
+    if path.exists() and (old := read_signed(path, form)["encoder"]["weights"]) != encoder["weights"]:
         raise ValueError(f"{path} is the result of other weights ({old[0][:12]}): give --name, or another --out")
-    start, parts, key = time.perf_counter(), out / "parts", digest(encoder)
-    entry = Entry(models, places, encoder["name"], encoder["trained_on"])
+    start = time.perf_counter()
     with hold_lock(path, f"another process writes {path}: wait for it, or give another --out", wait=False):
-        blocks = list(score_suite(entry, suite, root, parts, key))
-        if all("not_run" in block for block in blocks):
-            raise ValueError(f"{entry.name} was scored on no task of {suite.name}: {blocks[0]['not_run']}")
+        found = score(models, encoder)
         now = {"time": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": round(time.perf_counter() - start)}
-        write_result(path, sign(suite, encoder, blocks, {**provenance(), **now}))
-        for part in parts.glob(f"{key[:16]}-*.json"):
+        write_result(path, sign(form, suite, encoder, found, {**provenance(), **now}))
+        for part in (out / "parts").glob(f"{digest(encoder)[:16]}-*.json"):
             part.unlink()
     return path
 

@@ -30,7 +30,7 @@ from mvitac.evaluation.value_scores import SUMS, r_squared
 from mvitac.registry import from_json
 from mvitac.system.files import digest, read_json, write_atomic
 
-FORMAT, FORMAT_VERSION = "mvitac-bench", 2
+FORMAT, FORMAT_VERSION = FORM = "mvitac-bench", 2
 VOLATILE = ("digest", "about")  # fields that the digest leaves out
 KEY = ("source", "seed", "modality", "probe")
 COUNTS = ("n", "correct")  # sums per group of classes: rows, and those that are right
@@ -77,18 +77,17 @@ def _scores(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def sign(
-    suite: Suite, encoder: dict[str, Any], blocks: Sequence[dict[str, Any]], here: dict[str, Any]
+    form: tuple[str, int], suite: Any, encoder: dict[str, Any], found: dict[str, Any], here: dict[str, Any]
 ) -> dict[str, Any]:
-    """The whole result with its digest. ``here`` is ``provenance``, with the time."""
+    """The whole result with its digest. ``found`` is what was measured, ``here`` ``provenance``, with the time."""
     versions = here.pop("versions")
     value = {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
+        **dict(zip(("format", "format_version"), form, strict=True)),
         "suite": suite.definition(),
         "suite_digest": suite.digest(),
         "encoder": encoder,
         "versions": versions,
-        "blocks": list(blocks),
+        **found,
     }
     return {**value, "digest": digest(value), "about": here}
 
@@ -100,16 +99,22 @@ def write_result(path: Path, value: dict[str, Any]) -> None:
     write_atomic(path, lambda file: file.write(text.encode()))
 
 
-def read_result(path: Path) -> dict[str, Any]:
-    """Read a result; ValueError if it is none, is damaged, or was changed since it was written."""
+def read_signed(path: Path, form: tuple[str, int] = FORM) -> dict[str, Any]:
+    """Read a result of this format; ValueError if it is none, is damaged, or was changed since it was written."""
     value = read_json(path, "a result of the bench")
-    if not isinstance(value, dict) or value.get("format") != FORMAT:
+    if not isinstance(value, dict) or value.get("format") != form[0]:
         raise ValueError(f"{path} is not a result of the bench: give a file that `mvitac bench MODEL` wrote")
-    if value.get("format_version") != FORMAT_VERSION:
-        raise ValueError(f"{path} has format {value.get('format_version')}, this version reads {FORMAT_VERSION}")
+    if value.get("format_version") != form[1]:
+        raise ValueError(f"{path} has format {value.get('format_version')}, this version reads {form[1]}")
     given = digest({key: part for key, part in value.items() if key not in VOLATILE})
     if value.get("digest") != given:
         raise ValueError(f"{path} does not match its digest: it was changed after it was written, run the bench again")
+    return value
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """Read a result of a suite of tasks; ValueError also if its suite is not that of this version."""
+    value = read_signed(path)
     try:
         suite = suite_of(value)
     except (KeyError, ValueError) as error:
@@ -141,13 +146,7 @@ def pinned_of(suite: Suite, block: dict[str, Any]) -> str:
 def problems(value: dict[str, Any]) -> list[str]:
     """What is missing in a result, or cannot be, in one line each: tasks, scores, controls, sums, data."""
     suite, encoder = suite_of(value), value["encoder"]
-    found = []
-    if encoder["name"] in (*CONTROLS, GUESS):
-        found.append(f"the encoder has the name of a control, {encoder['name']!r}: give --name")
-    if (seen := encoder["images_seen"]) is not None and not (isinstance(seen, int) and seen >= 0):
-        found.append(f"images_seen is {seen}")
-    if not len(encoder["seeds"]) == len(set(encoder["seeds"])) == len(encoder["weights"]):
-        found.append(f"has {len(encoder['weights'])} weights for seeds {encoder['seeds']}")
+    found = list(problems_of(encoder, (*CONTROLS, GUESS)))
     asked = [(one, ask) for one in suite.sets for ask in one.tasks]
     if (want := [(s.name, t.name) for s, t in asked]) != (have := [(b["set"], b["task"]) for b in value["blocks"]]):
         return [*found, f"has the tasks {have}, the suite asks for {want}"]
@@ -155,6 +154,16 @@ def problems(value: dict[str, Any]) -> list[str]:
         if "not_run" not in block:
             found += [f"{one.name}, {ask.name}: {text}" for text in _of_block(block, suite, one, ask, encoder)]
     return found
+
+
+def problems_of(encoder: dict[str, Any], controls: Sequence[str]) -> Iterator[str]:
+    """What a result cannot say of its encoder."""
+    if encoder["name"] in controls:
+        yield f"the encoder has the name of a control, {encoder['name']!r}: give --name"
+    if (seen := encoder["images_seen"]) is not None and not (isinstance(seen, int) and seen >= 0):
+        yield f"images_seen is {seen}"
+    if not len(encoder["seeds"]) == len(set(encoder["seeds"])) == len(encoder["weights"]):
+        yield f"has {len(encoder['weights'])} weights for seeds {encoder['seeds']}"
 
 
 def _of_block(

@@ -151,8 +151,8 @@ def score_suite(entry: Entry, suite: Suite, root: Path | None, parts: Path, key:
     encoder.
     """
     here = provenance()
-    trunks = _trunks(suite)
-    weights = [model.weights_digest() for _, model in trunks]
+    beside = trunks(suite)
+    weights = [model.weights_digest() for _, model in beside]
     with work(f"{entry.name} on {suite.name}", sum(len(one.tasks) for one in suite.sets), "tasks") as advance:
         for one in suite.sets:
             opened = open_set(one, root)
@@ -161,18 +161,19 @@ def score_suite(entry: Entry, suite: Suite, root: Path | None, parts: Path, key:
                 advance(len(one.tasks))
                 continue
             own = [Reader(model, opened, entry.name) for model in entry.models]
-            beside = [Reader(model, opened, name) for name, model in trunks]
+            readers = [Reader(model, opened, name) for name, model in beside]
             for ask, task in opened.tasks:
                 about = [suite.digest(), one.name, ask.name, opened.digests, here["versions"], here["commit"]]
                 about_all = (opened, suite, ask, task)
-                controls = _kept(parts, "controls", [*about, weights], lambda r=beside, a=about_all: _controls(r, *a))
-                scored = _kept(parts, key, about, lambda r=own, a=about_all: _scores(r, *a))
+                known = [*about, weights]
+                controls = kept_part(parts, "controls", known, lambda r=readers, a=about_all: _controls(r, *a))
+                scored = kept_part(parts, key, about, lambda r=own, a=about_all: _scores(r, *a))
                 block = _block(entry, one, opened, ask, task, scored, controls)
                 yield {**block, "notes": own[0].notes} if scored else block
                 advance()
 
 
-def _trunks(suite: Suite) -> list[tuple[str, ExternalModel]]:
+def trunks(suite: Any) -> list[tuple[str, ExternalModel]]:
     """The controls that are networks, by name; that of ImageNet only where its weights can be had."""
     found = [("untrained", open_model(text)) for text in suite.untrained]
     try:
@@ -183,15 +184,15 @@ def _trunks(suite: Suite) -> list[tuple[str, ExternalModel]]:
 
 
 def _scores(readers: Sequence[Reader], opened: Opened, suite: Suite, ask: SuiteTask, task: AnyTask) -> Records:
-    return [record for reader in readers for record in reader.score(suite, ask, task, "", suite.probes)]
+    return [kept(record) for reader in readers for record in reader.score(suite, ask, task, "", suite.probes)]
 
 
 def _controls(readers: Sequence[Reader], opened: Opened, suite: Suite, ask: SuiteTask, task: AnyTask) -> Records:
     """Majority or mean, the data's own columns, pixels, border, and the untrained and ImageNet trunks of ``readers``."""
     each = [label_controls(view, [task]) + pixel_controls(view, [task], ask.modalities) for view in opened.packs]
-    trunks = [r for reader in readers for r in reader.score(suite, ask, task, reader.name, ["linear"])]
-    trunks = [{**r, "seed": None} if r["source"] == "imagenet" else r for r in trunks]
-    return [*(pool(each) if len(each) > 1 else each[0]), *trunks]
+    found = [r for reader in readers for r in reader.score(suite, ask, task, reader.name, ["linear"])]
+    found = [{**r, "seed": None} if r["source"] == "imagenet" else r for r in found]
+    return [kept(record) for record in (*(pool(each) if len(each) > 1 else each[0]), *found)]
 
 
 def _block(
@@ -216,9 +217,9 @@ def _block(
     }
 
 
-def _kept(parts: Path, key: str, about: list[Any], score: Callable[[], Records]) -> Records:
-    """The records of a part: those kept, else scored now and kept."""
+def kept_part(parts: Path, key: str, about: list[Any], score: Callable[[], Records]) -> Records:
+    """The records of a part of a result: those kept, else scored now and kept."""
     path = parts / f"{key[:16]}-{digest([key, *about])[:24]}.json"
     if not path.exists():
-        write_json(path, {"records": [kept(record) for record in score()]}, sealed=True)
+        write_json(path, {"records": score()}, sealed=True)
     return read_json(path, "a part of a bench")["records"]

@@ -13,8 +13,6 @@ from mvitac.bench.result import problems, read_result, records_of
 from mvitac.bench.suite import find_suite, shipped
 from mvitac.cli.options import parse
 from mvitac.control import result as loop
-from mvitac.control.suite import find_suite as find_loop
-from mvitac.control.suite import shipped as loops
 from mvitac.evaluation.leaks import leaks_of
 from mvitac.evaluation.scores import summarise
 from mvitac.report.tables import print_summary
@@ -61,13 +59,15 @@ _MANUAL = """Score an encoder on every task of a suite, beside the same controls
 
 def bench(argv: list[str]) -> None:
     """mvitac bench MODEL... --suite NAME [--out DIR] [--data-root DIR]"""
-    options = parse(_Options, argv, "bench", description=_MANUAL.format(suites=", ".join([*shipped(), *loops()])))
+    options = parse(
+        _Options, argv, "bench", description=_MANUAL.format(suites=", ".join([*shipped(), *loop.shipped()]))
+    )
     if not options.models:
         raise ValueError("name the encoder: the folder of a run or an artifact (see mvitac bench --help)")
-    if options.suite in loops():
+    if options.suite in loop.shipped():
         with shown():
-            path = loop.run_suite(options.models, find_loop(options.suite), options.out, options.about)
-        loop.print_result(loop.read_control(path))
+            path = loop.run_suite(options.models, loop.find_suite(options.suite), options.out, options.about)
+        loop.print_result(path)
         print(f"written: {path}")
         return
     suite = find_suite(options.suite)
@@ -103,7 +103,7 @@ def check(argv: list[str]) -> None:
         raise ValueError("name the results to check (see mvitac bench check --help)")
     for path in options.files:
         if loop.is_result(path):
-            value = loop.read_control(path)
+            _, value = loop.read_control(path)
             print(f"{path}: {value['encoder']['name']} on {value['suite']['name']}: {len(value['rows'])} rows hold")
             continue
         with fields_of(path):

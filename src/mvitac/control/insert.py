@@ -21,11 +21,7 @@ import numpy as np
 from mvitac.control.servo import FIELD_MM, SIZE, Copy, Shape, draw_copy, draw_shape, textured, textures
 from mvitac.sim.coordinates import grid
 
-LENGTH_M, DEPTH_M, CLEAR_M = (
-    0.024,
-    0.010,
-    0.0012,
-)  # of the peg below the hand, of the insertion, on each side of the peg
+LENGTH_M, DEPTH_M, CLEAR_M = 0.024, 0.010, 0.0012  # of the peg below the hand; of the insertion; beside the peg
 ABOVE_M, ALIGN, DOWN, SUBSTEPS = 0.016, 9, 9, 40  # height at the start; steps above the slot and down; steps of 2 ms
 DEPTH_MM = 0.8  # of the peg in the gel
 REACH = {"slot_mm": 7.0, "offset_mm": 2.5, "turn_deg": 9.0}
@@ -94,6 +90,7 @@ class Insertion:
 
     def see(self) -> np.ndarray:
         """The camera's picture, uint8 [64, 64, 3]."""
+        mujoco.mj_kinematics(self.model, self.data)  # of where the last step ended
         return _photograph(self.model, self.data, (*self.key, self.steps))
 
     def result(self, most_mm: float, most_deg: float, depth: float) -> tuple[bool, float, float]:
@@ -120,21 +117,6 @@ def touch_of(key: tuple[int, int, int]) -> np.ndarray:
     (peg, _), (_, copy) = draw_peg(key[0], key[2], bool(key[1])), _held(key[0])
     x, y, _ = grid(SIZE, FIELD_MM)
     return copy.press(DEPTH_MM + peg.height(x, y) + textured(peg, x, y), np.random.default_rng([_TAG, *key, 1]))
-
-
-def photo_of(asked: tuple[tuple[int, int, int], np.ndarray, int]) -> np.ndarray:
-    """``Insertion.see`` for other processes: of an episode, with the state of its physics, at a step."""
-    key, state, steps = asked
-    world = _world(key)
-    world.data.qpos[:] = state
-    mujoco.mj_kinematics(world.model, world.data)
-    world.steps = steps
-    return world.see()
-
-
-@lru_cache(maxsize=128)
-def _world(key: tuple[int, int, int]) -> Insertion:
-    return Insertion(key[0], key[2], trained=bool(key[1]))
 
 
 def _scene(peg: Peg, slot_mm: float) -> str:

@@ -1,8 +1,7 @@
-"""What learns from images in a closed loop: frozen features, pixels, and trunks trained along; heads are linear."""
+"""What learns from images in a closed loop: ridge on frozen features or pixels, and a trunk trained along with its head."""
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,20 +9,15 @@ import torch
 from torch import Tensor, nn
 
 from mvitac.bench.external import open_model
+from mvitac.evaluation.regressors import fit_ridge
 from mvitac.model import Model
 from mvitac.sim.gel import area_resize
 
 Encode = Callable[[str, np.ndarray], np.ndarray]  # modality, images uint8 [N, S, S, 3] -> features [N, D]
-Cells = list[dict[str, Any]]
-
-
-@dataclass(frozen=True)
-class Row:
-    """One row of a suite, and the function that scores it."""
-
-    source: str  # "" is the encoder
-    seed: int | None
-    score: Callable[[], Cells]
+Look = Callable[[str], np.ndarray]  # modality -> what all episodes show now, uint8 [E, S, S, 3]
+Estimate = Callable[[Look], np.ndarray]  # -> [E, T] or [T]
+Learn = Callable[[dict[str, np.ndarray], np.ndarray, int], Estimate]
+"""Images by modality, targets [N, T] of the first N of them, how many of the last of these choose a strength."""
 
 
 def encoding(model: Model) -> Encode:
@@ -44,17 +38,24 @@ def pixels(modality: str, images: np.ndarray) -> np.ndarray:
     return np.stack([area_resize(image.astype(np.float32), 8, 8).ravel() for image in images])
 
 
-def frozen_rows(
-    models: Sequence[Model], untrained: Sequence[str], imagenet: str
-) -> list[tuple[str, int | None, Encode]]:
-    """Source, seed and features of each frozen row: the encoder's seeds, pixels, untrained trunks, ImageNet if here."""
-    found: list[tuple[str, int | None, Encode]] = [("", model.seed, encoding(model)) for model in models]
-    found.append(("pixels", None, pixels))
-    found += [("untrained", model.seed, encoding(model)) for model in map(open_model, untrained)]
-    try:
-        return [*found, ("imagenet", None, encoding(open_model(imagenet)))]
-    except ValueError:  # its weights cannot be had here
-        return found
+def ridge(encode: Encode) -> Learn:
+    """Ridge regression on features; those of the images that are learned from are computed once."""
+    known: dict[int, np.ndarray] = {}
+
+    def learn(images: dict[str, np.ndarray], targets: np.ndarray, num_val: int) -> Estimate:
+        for modality, each in images.items():
+            if id(each) not in known:
+                known[id(each)] = encode(modality, each)
+        features = np.concatenate([known[id(each)][: len(targets)] for each in images.values()], axis=1)
+        fitted, _ = fit_ridge(features, targets, num_val)
+        return lambda look: fitted(np.concatenate([encode(each, look(each)) for each in images], axis=1))
+
+    return learn
+
+
+def blind(images: dict[str, np.ndarray], targets: np.ndarray, num_val: int) -> Estimate:
+    """The mean of the targets, whatever is seen."""
+    return lambda look: targets.mean(0)
 
 
 class _Network(nn.Module):
@@ -72,35 +73,28 @@ class _Network(nn.Module):
         return self.head(torch.cat([trunk(x) for trunk, x in zip(self.trunks, images, strict=True)], 1))
 
 
-def train(
-    text: str, images: Sequence[np.ndarray], targets: np.ndarray, *, steps: int
-) -> Callable[[Sequence[np.ndarray]], np.ndarray]:
-    """Train the network that ``text`` names, with a linear head, from images uint8 [N, S, S, 3] to ``targets`` [N, T].
-
-    Smooth L1 on standardised targets. Returns the function from images to targets.
-    """
-    mean, std = targets.mean(0), targets.std(0) + 1e-9
+def end_to_end(text: str, steps: int) -> Learn:
+    """Train the network that ``text`` names with a linear head, by smooth L1 on standardised targets."""
 
     def tensors(images: Sequence[np.ndarray]) -> list[Tensor]:
         return [torch.from_numpy(x).permute(0, 3, 1, 2) for x in images]
 
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        network = _Network(text, len(images), targets.shape[1]).train()
-        x, y = tensors(images), torch.from_numpy((targets - mean) / std).float()
-        optimiser = torch.optim.AdamW([p for p in network.parameters() if p.requires_grad], weight_decay=0.05)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=steps)
-        for _ in range(steps):
-            rows = torch.randint(len(y), (64,))
-            loss = nn.functional.smooth_l1_loss(network([each[rows] for each in x]), y[rows])
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            schedule.step()
-    network.eval()
+    def learn(images: dict[str, np.ndarray], targets: np.ndarray, num_val: int) -> Estimate:
+        mean, std = targets.mean(0), targets.std(0) + 1e-9
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            network = _Network(text, len(images), targets.shape[1]).train()
+            x, y = tensors(list(images.values())), torch.from_numpy((targets - mean) / std).float()
+            optimiser = torch.optim.AdamW([p for p in network.parameters() if p.requires_grad], weight_decay=0.05)
+            schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=steps)
+            for _ in range(steps):
+                rows = torch.randint(len(y), (64,))
+                loss = nn.functional.smooth_l1_loss(network([each[rows] for each in x]), y[rows])
+                optimiser.zero_grad()
+                loss.backward()
+                optimiser.step()
+                schedule.step()
+        network.eval().requires_grad_(False)
+        return lambda look: network(tensors([look(each) for each in images])).numpy() * std + mean
 
-    @torch.no_grad()
-    def estimate(images: Sequence[np.ndarray]) -> np.ndarray:
-        return network(tensors(images)).numpy() * std + mean
-
-    return estimate
+    return learn

@@ -1,29 +1,39 @@
-"""Suites of closed-loop tasks (``suites/*.toml``): versioned definitions, with every criterion as data."""
+"""What closed-loop suites share (``suites/*.toml``): a definition with every criterion as data, and the rows to score."""
 
-import tomllib
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
 
-from mvitac.registry import check_range, from_json, to_json, unknown
+import numpy as np
+
+from mvitac.bench.score import trunks
+from mvitac.control.learn import Learn, blind, encoding, end_to_end, pixels, ridge
+from mvitac.model import Model
+from mvitac.registry import to_json
 from mvitac.system.files import digest
 
-SUITES = Path(__file__).parent / "suites"
+Cells = list[dict[str, Any]]  # task, condition, n, and a list for each of ``LoopSuite.sums``
+OWN, SHUFFLED = "", "touch shuffled"  # rows of the encoder that is scored
 
 
-@dataclass(frozen=True, kw_only=True)
-class Condition:
-    """What is different in some episodes of the same shapes."""
+@dataclass(frozen=True)
+class Row:
+    """One row of a suite: its source, and how it learns; None knows the truth."""
 
-    name: str
-    new_sensor: bool = False
-    noise: float = 1.0  # multiplies the camera noise of the sensor
-    latency_ms: int = 0
+    source: str
+    seed: int | None
+    learn: Learn | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class LoopSuite:
-    """What both kinds of suite have; their files say what each field means."""
+    """A suite; its file says what each field means."""
+
+    sums: ClassVar[tuple[str, ...]]  # what is added up over a shape or an episode; the first is the score
+    kinds: ClassVar[list[str]]  # of tasks: the columns of a table
+    true: ClassVar[str]
+    blind: ClassVar[str]
+    note: ClassVar[str]
 
     name: str
     title: str
@@ -41,55 +51,22 @@ class LoopSuite:
     def digest(self) -> str:
         return digest(self.definition())
 
+    def rows(self, models: Sequence[Model]) -> list[Row]:
+        """The encoder's seeds first, then the controls; ImageNet only where its weights can be had."""
+        own = [Row(OWN, model.seed, ridge(encoding(model))) for model in models]
+        beside = [
+            Row(name, None if name == "imagenet" else model.seed, ridge(encoding(model)))
+            for name, model in trunks(self)
+        ]
+        known = Row(self.true, None, None), Row(self.blind, None, blind)
+        trained = Row("end to end", None, end_to_end(self.untrained[0], self.train_steps))
+        return [*own, Row("pixels", None, ridge(pixels)), *beside, replace(own[0], source=SHUFFLED), *known, trained]
 
-@dataclass(frozen=True, kw_only=True)
-class ServoSuite(LoopSuite):
-    """Tasks of ``control.servo``, one controller, and what estimates its pose."""
+    def cell(self, task: str, condition: str, n: Sequence[float], sums: np.ndarray) -> dict[str, Any]:
+        """A cell of a row, from the sums [len(self.sums), N] of its shapes or episodes in ten digits."""
+        each = {key: [float(f"{x:.10g}") for x in line] for key, line in zip(self.sums, sums.tolist(), strict=True)}
+        return {"task": task, "condition": condition, "n": list(n), **each}
 
-    kind: Literal["servo"]
-    shapes: int
-    steps: int
-    settle: int
-    gain: float
-    most: float
-    fit_shapes: int
-    fit_presses: int
-    fit_val: int
-    conditions: tuple[Condition, ...]
-
-    def __post_init__(self) -> None:
-        check_range(self, 2, 1000, "shapes")
-        check_range(self, self.settle + 1, 10_000, "steps")
-
-
-@dataclass(frozen=True, kw_only=True)
-class InsertSuite(LoopSuite):
-    """The task of ``control.insert``, and when it has succeeded."""
-
-    kind: Literal["insert"]
-    episodes: int
-    demonstrations: tuple[int, ...]
-    noise: float
-    success_mm: float
-    success_deg: float
-    success_depth: float
-
-    def __post_init__(self) -> None:
-        check_range(self, 2, 10_000, "episodes")
-
-
-def shipped() -> list[str]:
-    """Names of the closed-loop suites of this version."""
-    return sorted(path.stem for path in SUITES.glob("*.toml"))
-
-
-def read_suite(value: dict[str, Any]) -> ServoSuite | InsertSuite:
-    """The suite of a JSON object; ValueError if it is none."""
-    return from_json(InsertSuite if value.get("kind") == "insert" else ServoSuite, value, "suite")
-
-
-def find_suite(name: str) -> ServoSuite | InsertSuite:
-    """The suite ``name`` of this version."""
-    if name not in shipped():
-        raise unknown("suite", name, shipped())
-    return read_suite(tomllib.loads((SUITES / f"{name}.toml").read_text()))
+    def record(self, cell: dict[str, Any]) -> dict[str, Any]:
+        """A cell as ``evaluation.intervals`` takes it: the score, by shape or episode."""
+        return {"seed": cell["seed"], "group_sizes": cell["n"], "group_correct": cell[self.sums[0]]}
