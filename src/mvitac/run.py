@@ -184,7 +184,7 @@ class Run:
 
     def _check_encoder(self, modality: str, spec: DataSpec, stored_size: int) -> None:
         encoder, size = self.encoder[modality], self.augment.size_of(modality)
-        # Whole images may be enlarged: a network that learned on large ones sees more in them (docs/training.md).
+        # Whole images may be enlarged: a network that learned on large ones sees more in them (docs/start.md).
         if size > stored_size and not self.augment.of(modality).fixed:
             raise ValueError(
                 f"{modality} of {size} px cannot be cut from images stored at {stored_size} px:"

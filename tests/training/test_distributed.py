@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import safetensors.torch
+import timm
 import torch
 
 from mvitac.data.pack import Pack
@@ -128,6 +129,16 @@ def test_the_loop_keeps_banks_when_the_number_of_processes_changes(pack: Pack, t
             bank = state["method"][name]
             assert torch.equal(bank[~seen], before[~seen]) and not torch.isclose(bank[seen], before[seen]).all(1).any()
             torch.testing.assert_close(bank[seen].norm(dim=1), torch.ones(int(seen.sum())))
+
+
+def test_batchnorm_over_gpus_keeps_the_activation_that_timm_puts_into_it() -> None:
+    method, images = build(), torch.rand(2, 3, 32, 32)
+    trunk = timm.create_model("tf_efficientnet_lite0", num_classes=0).eval()
+    method.encoders()["touch"].add_module("inner", trunk)
+    before = trunk(images)
+    Step(run_of("mvitac"), method, torch.device("cuda"), World(0, 2))  # what it converts stays on the CPU here
+    assert any(isinstance(layer, torch.nn.SyncBatchNorm) for layer in trunk.modules())
+    assert torch.equal(trunk(images), before)
 
 
 def test_a_batch_that_does_not_divide_is_named() -> None:

@@ -5,7 +5,7 @@ processes are gathered, and each process computes the whole loss, so it has the 
 Parameter gradients are then summed. The result is the gradient of a single process on the joint batch
 (tests/training/test_distributed.py).
 
-On GPUs, BatchNorm has the statistics of all processes (torch's SyncBatchNorm). On CPUs each process has its own.
+On GPUs, BatchNorm has the statistics of all processes (``training/step.py``). On CPUs each process has its own.
 """
 
 import os

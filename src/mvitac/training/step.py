@@ -11,8 +11,9 @@ its running statistics are updated once per chunk.
 from collections.abc import Callable, Sequence
 
 import torch
+from timm.layers import convert_sync_batchnorm
 from timm.optim import param_groups_layer_decay  # pyright: ignore[reportPrivateImportUsage]
-from torch import Tensor, nn
+from torch import Tensor
 
 from mvitac.methods.base import Contrastive, Embeddings, Method, Views
 from mvitac.nn.encoders import Encoders, PerFrame
@@ -32,7 +33,7 @@ class Step:
     def __init__(self, run: Run, method: Method, device: torch.device, world: World | None = None) -> None:
         self.method, self.device, self.world, self.bf16 = method, device, world or World(), run.bf16
         if self.world.size > 1 and device.type == "cuda":  # torch has none for CPUs
-            nn.SyncBatchNorm.convert_sync_batchnorm(method)
+            convert_sync_batchnorm(method)  # timm's, as torch's own drops the activation that timm puts into some layers
         self.optimiser = build_optimiser(run.optim, method, run.encoder)
         if (run.chunk or self.world.size > 1) and not isinstance(method, Contrastive):
             raise ValueError(f"method {run.method.name!r} supports neither several processes nor --chunk")
