@@ -311,11 +311,6 @@ def test_a_crop_is_cut_out_of_images_and_backgrounds(tmp_path: Path) -> None:
             FolderConfig(**options, crop=(wrong,))
 
 
-def nested(**content: Any) -> dict[str, Any]:
-    return {f"data/demo_{k}/{name.replace('__', '/')}": value for k in range(2) for name, value in content.items()}
-
-
-IMAGES = {"camera": grays(*range(20)), "gel": grays(*range(20))}
 BAD: dict[str, tuple[dict[str, Any], dict[str, str], str]] = {
     "dataset missing": (flat(gel=None), {}, r"has no image dataset 'gel' \(it has camera \[20, 16, 20, 3\]\)"),
     "both missing": (flat(gel=None, camera=None), {}, r"no image dataset 'camera' or 'gel' \(it has none\)"),
@@ -365,16 +360,6 @@ BAD: dict[str, tuple[dict[str, Any], dict[str, str], str]] = {
         r"assigning 1 groups .*: give more groups \(--group COLUMN\)",
     ),
     "one id twice": (flat(id=np.ones(20, int)), {}, "id '1' occurs in several rows"),
-    "part of a demonstration": (
-        nested(obs__camera=IMAGES["camera"], obs__gel=IMAGES["gel"], force_n=np.arange(20)),
-        {},
-        "data/demo_0/obs/camera belongs to data/demo_0, .*from there, obs/camera",
-    ),
-    "touch in a part": (
-        nested(camera=IMAGES["camera"], obs__gel=IMAGES["gel"]),
-        {},
-        "data/demo_0/obs/gel belongs to data/demo_0, .*from there, obs/gel",
-    ),
 }
 
 

@@ -417,7 +417,7 @@ def test_hub_files_name_their_split_all_or_none(tmp_path: Path) -> None:
     root = make_hub(tmp_path / "data")
     options: dict[str, Any] = {"path": root, "size": 16, "labels": ("kind",), "group": "thing"}
     (root / "train-00001-of-00002.parquet").rename(root / "more.parquet")
-    with pytest.raises(ValueError, match=r"the name of more\.parquet says no split, others do: begin it with train-"):
+    with pytest.raises(ValueError, match=r"column 'split' \(split\) is empty"):
         HubConfig(**options).source()
     assert HubConfig(**options, split="by-group").source().spec().group_by == "thing"
 

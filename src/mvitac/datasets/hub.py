@@ -42,15 +42,8 @@ class HubConfig(RowsConfig):
             images = _read(file, rows, found, self.vectors())
             if not images:
                 raise ValueError(f"{file} has no image column (struct<bytes, path> or binary): is it the right file?")
-            if all(sides):
-                for row in rows[before:]:
-                    row.setdefault("split", str(side))
-        nameless = [file.name for file, side in zip(files, sides, strict=True) if not side]
-        if any(sides) and nameless and not self.split and not any("split" in row for row in rows):
-            raise ValueError(
-                f"{self.path}: the name of {nameless[0]} says no split, others do: begin it with train-, validation- or"
-                " test-, remove it, or --data.split by-group assigns all rows to splits"
-            )
+            for row in rows[before:] if side else ():
+                row.setdefault("split", side)
         for column, places in found.items():
             if len(places) < len(rows):
                 raise ValueError(f"{self.path}: image column {column!r} is not in every file")

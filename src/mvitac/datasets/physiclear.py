@@ -19,7 +19,6 @@ from tyro.conf import Fixed
 from mvitac.data.video import num_frames, spread
 from mvitac.datasets.table.manifest import Manifest, in_clone
 from mvitac.datasets.table.table import RowsConfig
-from mvitac.registry import check_range
 from mvitac.system.files import brief
 
 LABELS = {
@@ -28,6 +27,7 @@ LABELS = {
     "roughness": "ROUGHNESS_RANK",
     "bumpiness": "TEXTURE_RANK",
 }
+SPAN = (0.3, 0.6)  # part of a video's length that frames are from: it begins and ends without contact
 SPLIT = {"train": "TRAIN_OBJECTS", "val": "VAL_OBJECTS", "test": "TEST_OBJECTS"}
 
 
@@ -41,8 +41,6 @@ class PhysiclearConfig(RowsConfig):
     """Folder of the clone."""
     frames: Fixed[int] = 8
     """Number of frames per video."""
-    span: Fixed[tuple[float, float]] = (0.3, 0.6)
-    """Part of each video to take frames from, as fractions of its length: videos begin and end without contact."""
     title: str | None = "physiclear"
     labels: tuple[str, ...] = tuple(LABELS)
     group: str | None = "object"
@@ -51,14 +49,6 @@ class PhysiclearConfig(RowsConfig):
     """by-group: test on unseen objects; owners_split: the owners' split, with 7 objects in test."""
     licence: str = "none stated"
     source_url: str = "https://github.com/clear-nus/octopi"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_range(self, 1, 1000, "frames")
-        if not 0 <= self.span[0] <= self.span[1] <= 1:
-            raise ValueError(
-                f"span {self.span[0]} {self.span[1]}: give two fractions of the length, 0 <= first <= last <= 1"
-            )
 
     def manifest(self) -> Manifest:
         videos = in_clone(self.path, "dataset", "*.mov", self.source_url)
@@ -75,7 +65,7 @@ class PhysiclearConfig(RowsConfig):
             same = {"touch": place, "background": place, "background_frame": "0", "video": path.stem, "object": thing}
             same |= {label: str(found.get(key, "")) for label, found in labels.items()}
             same |= {"owners_split": split.get(key, "unlabelled"), "n_frames": str(length)}
-            for seq, at in enumerate(spread(self.frames, length, *self.span)):
+            for seq, at in enumerate(spread(self.frames, length, *SPAN)):
                 rows.append({**same, "frame": str(at), "seq": str(seq)})
         return Manifest.of(root, rows)
 

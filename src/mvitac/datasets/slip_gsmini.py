@@ -14,15 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from tyro.conf import Fixed
-
 from mvitac.data.video import num_frames, spread
 from mvitac.datasets.table.manifest import Manifest, in_clone
 from mvitac.datasets.table.splits import add_folds
 from mvitac.datasets.table.table import RowsConfig
-from mvitac.registry import check_range
 from mvitac.system.files import digest_file
 
+NUM_FRAMES = 12  # per recording, evenly spaced from the first to the last
 FINGERS = {"left": "camera_0.avi", "right": "camera_2.avi"}
 ALIASES = {"bag_of_peanuts": "bag_peanuts"}  # names of the same object, which must not be in different splits
 
@@ -35,8 +33,6 @@ class SlipGSMiniConfig(RowsConfig):
 
     path: Path = Path("Incipient-Slip-Detection")
     """Folder of the clone."""
-    frames: Fixed[int] = 12
-    """Number of frames per recording, evenly spaced from the first to the last."""
     title: str | None = "slip_gsmini"
     labels: tuple[str, ...] = ("slip",)
     group: str | None = "object"
@@ -46,10 +42,6 @@ class SlipGSMiniConfig(RowsConfig):
     controls: tuple[str, ...] = ("recording length=n_frames",)
     licence: str = "BSD-2-Clause (the repository's LICENSE)"
     source_url: str = "https://github.com/amitparag/Incipient-Slip-Detection"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_range(self, 1, 1000, "frames")
 
     def manifest(self) -> Manifest:
         root = in_clone(self.path, "docs", "**/exp_num_*/camera_0.avi", self.source_url)
@@ -92,4 +84,4 @@ class SlipGSMiniConfig(RowsConfig):
             "author_split": "train" if "train" in sides else "val" if sides else "extra",
         }
         known["label_conflict"] = str(int(not known["slip"]))
-        return [{**known, "frame": str(at), "seq": str(seq)} for seq, at in enumerate(spread(self.frames, length))]
+        return [{**known, "frame": str(at), "seq": str(seq)} for seq, at in enumerate(spread(NUM_FRAMES, length))]

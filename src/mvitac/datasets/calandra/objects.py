@@ -34,16 +34,16 @@ REPAIRS = {
 """Wrong name in some recordings (cut to 11 letters, or another word) -> object, from the owners' scripts."""
 
 
-def object_name(value: Any, repairs: dict[str, str]) -> str:
+def object_name(value: Any) -> str:
     """Return the repaired name in an object_name attribute (bytes, text, or an array of one)."""
     value = np.asarray(value).reshape(-1)
     if len(value) != 1 or not isinstance(value[0], (bytes, str)):
-        raise ValueError(f"it is {value.tolist()}, not one name")
+        raise ValueError(f"object_name is {value.tolist()}, not one name")
     text = value[0].decode("utf-8") if isinstance(value[0], bytes) else str(value[0])
     name = text.strip(" \0\n\r\t")
     if not name:
-        raise ValueError("it is empty")
-    return repairs.get(name, name)
+        raise ValueError("object_name is empty")
+    return REPAIRS.get(name, name)
 
 
 def most_attempted(counts: Counter[str]) -> list[str]:

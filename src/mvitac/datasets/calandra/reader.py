@@ -77,10 +77,6 @@ class CalandraConfig(DatasetConfig):
     """Phases that become rows. All of them are used for pre-training."""
     kinect_crop: Fixed[bool] = False
     """Crop the camera image to the table, as the owners do."""
-    extra_objects: Fixed[bool] = False
-    """Keep the objects outside the authors' 40 as unlabelled rows for pre-training (split authors)."""
-    repairs: Fixed[tuple[str, ...]] = ()
-    """Additional object names to repair, as "wrong=right"."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -96,9 +92,6 @@ class CalandraConfig(DatasetConfig):
         for asked in self.ask:
             if (needed := "during" if asked == "authors" else asked) not in self.phases:
                 raise ValueError(f"ask {asked}: phases leaves {needed!r} out, add it")
-        for text in self.repairs:
-            if not re.fullmatch(r"[^=]+=[^=]+", text):
-                raise ValueError(f"repairs {text!r}: write it as wrong=right")
 
     def source(self) -> Source:
         return Calandra(self)
@@ -124,8 +117,7 @@ class Calandra(Source):
     def __init__(self, config: CalandraConfig) -> None:
         self.config = config
         self._files = {file: stamp_of(str(file)) for file in find_shards(config.path, config.shards)}
-        repairs = objects.REPAIRS | dict(text.split("=") for text in config.repairs)
-        everything = [grasp for file in self._files for grasp in list_grasps(file, repairs)]
+        everything = [grasp for file in self._files for grasp in list_grasps(file)]
         self.counts = Counter(grasp.object for grasp in everything if not grasp.damage)
         """Attempts per object in all shards, including objects that the split leaves out."""
         if not self.counts:
@@ -235,7 +227,7 @@ def find_shards(path: Path, shards: Sequence[int]) -> list[Path]:
     return [files[number] for number in sorted(shards or files)]
 
 
-def list_grasps(file: Path, repairs: dict[str, str]) -> list[Grasp]:
+def list_grasps(file: Path) -> list[Grasp]:
     """Return every grasp of a shard with name and outcome. In a shard that cannot be opened, all grasps are damaged."""
     import h5py
 
@@ -244,25 +236,22 @@ def list_grasps(file: Path, repairs: dict[str, str]) -> list[Grasp]:
         with h5py.File(file) as opened:
             data: Any = opened["data"]
             indices = sorted(int(name[1:]) for name in data if re.fullmatch(r"i\d+", name))
-            return [_describe(data, Grasp(file, shard, index), repairs) for index in indices]
+            return [_describe(data, Grasp(file, shard, index)) for index in indices]
     except (OSError, KeyError, RuntimeError, TypeError) as error:  # h5py raises these for damaged files
         damage = f"{file.name} cannot be read as HDF5 ({brief(error)}): download it again or leave it out of shards"
         num = NUM_GRASPS - NUM_PER_SHARD * shard if shard == NUM_SHARDS - 1 else NUM_PER_SHARD
         return [Grasp(file, shard, index, damage=damage) for index in range(num)]
 
 
-def _describe(data: Any, grasp: Grasp, repairs: dict[str, str]) -> Grasp:
-    what = "attributes"
+def _describe(data: Any, grasp: Grasp) -> Grasp:
     try:
         attributes = data[f"i{grasp.index}"].attrs
-        what = "attribute object_name"
-        name = objects.object_name(attributes["object_name"], repairs)
-        what = "attribute is_gripping"
+        name = objects.object_name(attributes["object_name"])
         gripping = np.asarray(attributes["is_gripping"]).reshape(-1)
         if len(gripping) != 1 or gripping[0] not in (0, 1):
-            raise ValueError(f"it is {gripping.tolist()}, not one true or false")
+            raise ValueError(f"is_gripping is {gripping.tolist()}, not one true or false")
     except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
-        why = f"{grasp.file.name} i{grasp.index}: {what} cannot be read ({brief(error)})"
+        why = f"{grasp.file.name} i{grasp.index}: attributes cannot be read ({brief(error)})"
         return Grasp(grasp.file, grasp.shard, grasp.index, damage=why)
     return Grasp(grasp.file, grasp.shard, grasp.index, name, bool(gripping[0]))
 
@@ -285,8 +274,6 @@ def crop_kinect(image: np.ndarray) -> np.ndarray:
 
 def may_ask(asked: Ask, phase: str, split: str) -> bool:
     """Return whether a row of ``phase`` in ``split`` has the label of task ``asked``."""
-    if split == "unlabelled":
-        return False
     if asked == "authors":
         return phase == "during" or split == "train"
     return phase == asked
@@ -297,21 +284,20 @@ def split_objects(config: CalandraConfig, names: Sequence[str]) -> dict[str, str
     if config.split == "authors":
         splits = {name: "train" for name in names if name in AUTHORS_TRAIN}
         splits |= {name: "test" for name in names if name in AUTHORS_TEST}
-        others = {name: "unlabelled" for name in names if name not in splits} if config.extra_objects else {}
     elif config.split == "object":
         shuffled = objects.owners_shuffle(names, config.split_seed)
         num_train = int(0.75 * len(shuffled))
-        splits, others = {name: "train" if i < num_train else "test" for i, name in enumerate(shuffled)}, {}
+        splits = {name: "train" if i < num_train else "test" for i, name in enumerate(shuffled)}
     else:
         out = config.split.removeprefix("fold:")
         if out.isdigit() and out not in names and int(out) < len(names):
             out = names[int(out)]
         if out not in names:
             raise unknown(f"object in split {config.split!r} (or give 0 to {len(names) - 1})", out, names)
-        splits, others = {name: "test" if name == out else "train" for name in names}, {}
+        splits = {name: "test" if name == out else "train" for name in names}
     if not splits:
         raise ValueError(f"{config.path} holds none of the authors' 40 objects: use split object, or more shards")
     train = sorted(name for name, split in splits.items() if split == "train")
     num_val = round(config.val_share * len(train))
     chosen = np.random.default_rng([40, config.split_seed]).permutation(train)[:num_val].tolist()
-    return others | splits | dict.fromkeys(chosen, "val")
+    return splits | dict.fromkeys(chosen, "val")

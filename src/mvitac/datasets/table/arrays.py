@@ -82,24 +82,12 @@ def _demonstrations(file: Path, datasets: dict[str, Any], images: Collection[str
     """Return the paths of the groups that hold image datasets ("" = the file itself)."""
     if not datasets:
         raise ValueError(f"{file} holds no datasets: is it the right file?")
-    groups: dict[str, str] = {}
-    for path, dataset in datasets.items():
-        for name in images or USUAL:
-            if f"/{path}".endswith(f"/{name}") and (images or _holds_images(dataset)):
-                groups.setdefault(path[: -len(name)].rstrip("/"), path)
+    found = ((path, name) for path in datasets for name in images or USUAL if f"/{path}".endswith(f"/{name}"))
+    shown = ((path, name) for path, name in found if images or _holds_images(datasets[path]))
+    groups = list(dict.fromkeys(path[: -len(name)].rstrip("/") for path, name in shown))
     if not groups:
         raise _no_images(file, images or USUAL[:2], _seen(datasets))
-    rows = {(path.rpartition("/")[0], *dataset.shape[:1]) for path, dataset in datasets.items()}
-    whole = {group: _topmost(group, datasets[path], rows) for group, path in groups.items()}
-    parts = [group for group, top in whole.items() if top != group]
-    # The length of one demonstration may be that of a list above it by chance.
-    if parts and (len(parts) == len(groups) or any(whole[group] in groups for group in parts)):
-        path, top = groups[parts[0]], whole[parts[0]]
-        raise ValueError(
-            f"{file}: {path} belongs to {top or 'the datasets of the file'}, which has other datasets of this length:"
-            f" name it by its path from there, {path.removeprefix(top).strip('/')}"
-        )
-    return list(groups)
+    return groups
 
 
 def _episodes(demo: str, ends: Any, num: int) -> list[tuple[str, int]]:
@@ -125,13 +113,6 @@ def _holds_images(data: Any) -> bool:
         return False
     first = entry(data, 0)
     return isinstance(first, bytes) and first.startswith(MAGIC)
-
-
-def _topmost(group: str, image: Any, rows: set[tuple[Any, ...]]) -> str:
-    """Return the highest group above ``group`` that itself has a dataset as long as ``image``; else ``group``."""
-    parts = group.split("/") if group else []
-    above = ("/".join(parts[:depth]) for depth in range(len(parts)))
-    return next((name for name in above if (name, *image.shape[:1]) in rows), group)
 
 
 def _seen(datasets: dict[str, Any]) -> str:

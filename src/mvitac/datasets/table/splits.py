@@ -74,19 +74,11 @@ def _root(parent: dict[str, str], name: str) -> str:
     return name
 
 
-def likely_split(name: str) -> str | None:
-    """Return the split that ``name`` usually stands for, if any."""
-    near = {"validation": "val", "valid": "val", "dev": "val", "eval": "val", "training": "train"}
-    near |= {"testing": "test", "unseen": "test", "unlabeled": "unlabelled", **{split: split for split in SPLITS}}
-    return near.get(name.lower())
-
-
 def check_split_names(where: str, column: str, numbers: Sequence[int], splits: Sequence[str]) -> None:
     for number, split in zip(numbers, splits, strict=True):
         if split not in SPLITS:
-            wanted = likely_split(split)
-            hint = f"; write {wanted!r} instead" if wanted else f"; or --data.split {BY_GROUP} ignores the column"
-            raise ValueError(f"{where} row {number}: {unknown(f'split in column {column!r}', split, SPLITS)}{hint}")
+            hint = f"or --data.split {BY_GROUP} ignores the column"
+            raise ValueError(f"{where} row {number}: {unknown(f'split in column {column!r}', split, SPLITS)}; {hint}")
 
 
 def check_leak(where: str, split: str, what: str, values: Sequence[str], splits: Sequence[str]) -> None:

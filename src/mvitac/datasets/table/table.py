@@ -123,14 +123,7 @@ class RowsConfig(DatasetConfig, ABC):
         self.looks()
         if len(self.touch) > 2:
             raise ValueError(f"touch {' '.join(self.touch)}: give one column, or two to stack (left right)")
-        named = Counter([*self.touch, *([self.vision] if self.vision else [])])
-        if max(named.values(), default=1) > 1:
-            raise ValueError(f"column {named.most_common(1)[0][0]!r} is named twice: every image needs its own column")
-        if len(set(self.labels)) < len(self.labels):
-            raise ValueError(f"labels {' '.join(self.labels)}: name every column once")
-        for name, used in self.control_columns().items():
-            if not name or not all(used):
-                raise ValueError(f"control {name!r}: write it as name=column or name=column,column")
+        for name in self.control_columns():
             if name in CONTROL_NAMES:
                 raise ValueError(
                     f"control {name!r} is always computed: choose a name not among {', '.join(CONTROL_NAMES)}"

@@ -17,8 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from tyro.conf import Fixed
-
 from mvitac.data.source import Count, Lost, Sample, Source, one_stamp
 from mvitac.data.spec import MODALITIES, DataSpec, Task
 from mvitac.datasets.base import KEEPING, DatasetConfig
@@ -54,8 +52,6 @@ class TouchAndGoConfig(DatasetConfig):
     the paper; 100 of their 106 test recordings are also in train, which results note."""
     modalities: Literal["both", "vision", "touch"] = "both"
     """Which images to pack, e.g. touch if only the GelSight videos were downloaded."""
-    frames: Fixed[Literal["auto", "video", "jpeg"]] = "auto"
-    """video: read the mp4 files. jpeg: read the extracted folders. auto: the mp4 if it exists."""
     partial: bool = False
     """Pack the available recordings and list the missing ones, instead of stopping."""
     unlabelled: int = 0
@@ -189,10 +185,10 @@ class TouchAndGo(Source):
 def _find_recordings(config: TouchAndGoConfig, names: list[str]) -> tuple[list[Recording], dict[str, str]]:
     """Return the recordings to pack, and why each other one of ``names`` cannot be used."""
     modalities = MODALITIES if config.modalities == "both" else (config.modalities,)
-    found, missing = recordings.find_recordings(config.root, names, modalities, config.frames)
+    found, missing = recordings.find_recordings(config.root, names, modalities)
     if config.unlabelled:
         others = sorted(recordings.on_disk(config.root).keys() - set(names))
-        found += recordings.find_recordings(config.root, others, modalities, config.frames)[0]
+        found += recordings.find_recordings(config.root, others, modalities)[0]
     if not found or (missing and not config.partial):
         hint = "" if config.modalities != "both" else "; modalities=touch needs only gelsight"
         advice = f"fetch them from {HOMEPAGE}, or let partial pack what is there{hint}"

@@ -10,7 +10,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -72,7 +72,7 @@ def on_disk(root: Path) -> dict[str, str]:
 
 
 def find_recordings(
-    root: Path, names: Iterable[str], modalities: Sequence[str], frames: Literal["auto", "video", "jpeg"]
+    root: Path, names: Iterable[str], modalities: Sequence[str]
 ) -> tuple[list[Recording], dict[str, str]]:
     """Return the recordings in ``names`` with all ``modalities``, and why each of the others cannot be used."""
     base, folders = _base(root), on_disk(root)
@@ -82,12 +82,12 @@ def find_recordings(
         places, lacking = {}, []
         for modality in modalities:
             movie, images = folder / f"{STEMS[modality]}.mp4", folder / f"{STEMS[modality]}_frame"
-            if frames != "jpeg" and movie.is_file() and movie.stat().st_size:
+            if movie.is_file() and movie.stat().st_size:
                 places[modality] = movie
-            elif frames != "video" and images.is_dir():
+            elif images.is_dir():
                 places[modality] = images
             else:
-                lacking.append({"auto": movie, "video": movie, "jpeg": images}[frames].name)
+                lacking.append(movie.name)
         if lacking:
             missing[name] = f"no {' and '.join(lacking)}" if folder.is_dir() else "no folder"
         else:
