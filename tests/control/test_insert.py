@@ -1,6 +1,7 @@
 """Inserting a peg needs both senses, the camera never shows the peg, and rows score what they say."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -72,6 +73,26 @@ def test_only_the_camera_shows_the_slot_and_only_the_gel_the_peg() -> None:
     assert np.array_equal(other.touch(), Insertion(0, 4).touch())
 
 
+def test_demonstrations_are_other_grasps_and_go_astray(small: Insert) -> None:
+    images, actions = small.recorded
+    wanted = actions.reshape(5, -1, 2)
+    assert np.ptp(wanted, axis=1).max() == 0  # the set point does not change within an episode
+    for number in range(5):
+        assert np.abs(wanted[:, 0] - Insertion(0, number).wanted).max(1).min() > 0.01
+    world = Insertion(0, 0, trained=True)
+    assert np.array_equal(images["vision"][0], world.see()) and np.array_equal(images["touch"][0], world.touch())
+    for _ in range(4):
+        world.step(world.wanted)
+    assert np.abs(images["vision"][4].astype(int) - world.see()).mean() > 1
+
+
+def test_the_suite_shows_what_was_measured() -> None:
+    """Mean levels: another processor rounds a pixel otherwise, another scene does not come near."""
+    worlds = [Insertion(0, 1, trained=trained) for trained in (True, False)]
+    assert [world.see().mean() for world in worlds] == pytest.approx([171.35, 176.50], abs=0.05)
+    assert [world.touch().mean() for world in worlds] == pytest.approx([140.716, 140.725], abs=0.004)
+
+
 def test_gymnasium_environment() -> None:
     gymnasium = pytest.importorskip("gymnasium")
     from gymnasium.utils.env_checker import check_env
@@ -109,7 +130,6 @@ def test_regression_finds_what_pictures_show(small: Insert) -> None:
     """From images that are the answer itself, the clone is the expert; shuffled touch takes its half of it away."""
     few = replace(small, episodes=4, demonstrations=(6,))
     images, actions = few.recorded
-    assert np.ptp(actions.reshape(6, -1, 2), axis=1).max() == 0  # the set point does not change within an episode
     known = {images[sense][row].tobytes(): actions[row] for sense in images for row in range(len(actions))}
 
     def oracle(modality: str, pictures: np.ndarray) -> np.ndarray:
@@ -120,3 +140,9 @@ def test_regression_finds_what_pictures_show(small: Insert) -> None:
     assert all(cells["touch"]["success"]) and not all(cells["vision"]["success"])
     shuffled = {cell["task"]: cell for cell in few.score(Row("touch shuffled", 0, ridge(oracle)))}
     assert not any(shuffled["touch"]["success"])
+    looks: list[Callable[[str], np.ndarray]] = []
+    for source in ("", "touch shuffled"):
+        few.score(Row(source, 0, lambda *_: lambda look: looks.append(look) or np.zeros(2)))
+    for sense, other in (("vision", 0), ("touch", 1)):
+        plain, given = (look(sense) for look in (looks[0], looks[-1]))
+        assert np.array_equal(given, np.roll(plain, other, axis=0)) and not np.array_equal(plain, np.roll(plain, 1, 0))

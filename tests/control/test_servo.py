@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mvitac.bench.encoder import About
+from mvitac.bench.external import open_model
 from mvitac.bench.result import VOLATILE
 from mvitac.cli.main import main
 from mvitac.control import result
@@ -178,6 +179,57 @@ def test_a_star_is_over_shapes_and_seeds(small: Servo) -> None:
         return result._cell(small, known, "pixels", ("straight", "late")).endswith("*")
 
     assert marked((2.0, 2.02)) and not marked((2.0, 1.2))
+
+
+def first_look(suite: Servo, source: str, asked: float = 0.0) -> tuple[list[np.ndarray], list[dict[str, Any]]]:
+    """What a row sees in the first step of straight edges, and the row's cells if it asks for ``asked`` everywhere."""
+    seen: list[np.ndarray] = []
+
+    def learn(images: dict[str, np.ndarray], poses: np.ndarray, num_val: int) -> Any:
+        return lambda look: seen.append(look("touch")) or np.full(poses.shape[1], asked)
+
+    cells = suite.score(Row(source, 0, learn))
+    return list(seen[0]), cells
+
+
+def test_a_row_sees_its_own_episode_and_the_shuffled_one_the_next(small: Servo) -> None:
+    two = Condition(name="a"), Condition(name="b", new_sensor=True, noise=3.0)
+    few = replace(small, steps=1, settle=0, conditions=two)
+    plain, cells = first_look(few, "", 1e3)
+    shuffled, _ = first_look(few, "touch shuffled")
+    for number in range(4):
+        options: dict[str, Any] = {"new": True, "noise": 3.0} if number > 1 else {}
+        episode = Episode.begin(0, "straight", number % 2, **options)
+        assert np.array_equal(plain[number], episode.touch())
+        assert np.array_equal(plain[number], shuffled[number ^ 1])
+        before = episode.error()[0]
+        assert abs(cells[number // 2]["mm"][number % 2] - before) < 1.5 * few.most * Edge.limit[0]  # it was bounded
+
+
+def test_rows(small: Servo) -> None:
+    rows = small.rows([open_model(RANDOM.format(seed)) for seed in (5, 6)])
+    own = [("", 5), ("", 6), ("pixels", None), ("untrained", 0), ("untrained", 1), ("imagenet", None)]
+    rest = [("touch shuffled", 5), ("true pose", None), ("no touch", None), ("end to end", None)]
+    assert [(row.source, row.seed) for row in rows if row.source != "imagenet"] == own[:-1] + rest
+    assert rows[-4].learn is rows[0].learn and rows[-3].learn is None
+    targets = np.array([[1.0, 2.0], [3.0, 8.0]])
+    assert rows[-2].learn({}, targets, 1)({}.__getitem__).tolist() == [2.0, 5.0]  # type: ignore[misc]
+
+
+def test_the_suite_shows_what_was_measured() -> None:
+    """Mean levels: another processor rounds a pixel otherwise, another scene does not come near."""
+    levels = {
+        "straight": [87.89, 103.34],
+        "curved": [86.86, 102.87],
+        "corner": [104.79, 107.80],
+        "surface": [133.27, 112.03],
+    }
+    for kind in KINDS:
+        seen = [Episode.begin(0, kind, 0, new=new).touch().mean() for new in (False, True)]
+        assert seen == pytest.approx(levels[kind], abs=0.05)
+    images, poses = presses("edge", 0, 2, 0)
+    assert images.mean() == pytest.approx(102.91, abs=0.05)
+    assert np.allclose(poses, [[-3.011, -14.194], [-1.259, -3.834]], atol=1e-3)
 
 
 def test_latency_hurts(small: Servo) -> None:
