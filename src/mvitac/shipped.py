@@ -11,8 +11,6 @@ def named(place: str) -> str:
 
 
 def with_names(words: list[str]) -> list[str]:
-    """The words of a command with the shipped model's folder for its name. Values of options, but --init's, stay."""
+    """The words of a command with the shipped model's folder for its name. Values of options, but --model's, stay."""
     before = ["", *words]
-    return [
-        named(word) if not before[i].startswith("--") or before[i] == "--init" else word for i, word in enumerate(words)
-    ]
+    return [named(w) if b == "--model" or not b.startswith("--") else w for b, w in zip(before, words, strict=False)]

@@ -5,8 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import mvitac
+from mvitac.cli.main import main
+from mvitac.datasets.simulated import MaterialsConfig
+from mvitac.deploy.publish import own_data
 from mvitac.evaluation.leaks import read_sources
 from mvitac.shipped import BASE, named, with_names
 from mvitac.training.start import read_start
@@ -27,11 +31,33 @@ def test_base_answers_offline_by_its_name(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_commands_know_base(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    words = ["base", "--init", "base", "--name", "base", "--on", "base"]
-    assert with_names(words) == [str(BASE), "--init", str(BASE), *words[3:]]
+    words = ["base", "--model", "base", "--name", "base", "--init", "base"]
+    assert with_names(words) == [str(BASE), "--model", str(BASE), *words[3:]]
     run = replace(mvitac.recipe("locked"), init=mvitac.Init(path=Path("base")))
     start = read_start(run.init)
     assert start is not None and set(start.trunks) == {"vision", "touch"}
+
+
+def test_base_is_exported_on_a_few_rows_and_only_if_it_can_be_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its own 24,000 rows take minutes to simulate."""
+    opened: list[MaterialsConfig] = []
+    monkeypatch.setattr(MaterialsConfig, "open", lambda self, **_: opened.append(self))
+    monkeypatch.chdir(tmp_path)
+    Image.new("RGB", (32, 32)).save("frame.png")
+    assert main(["predict", "base", "."]) == 2 and "takes vision and touch" in capsys.readouterr().err and not opened
+    model = mvitac.load("base")
+    own_data(model, "", few=True)
+    assert opened == [replace(model.run.data, num=1000)]
+
+
+def test_a_report_of_base_is_not_in_the_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("mvitac.report.report.write_report", lambda runs, out, **_: f"{runs[0]} in {out}")
+    assert main(["report", "base"]) == 0 and capsys.readouterr().out == f"written: {BASE} in runs/report\n"
 
 
 def test_a_probe_of_base_writes_nothing_into_the_package(tmp_path: Path) -> None:

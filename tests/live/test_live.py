@@ -459,9 +459,7 @@ def test_each_artifact_of_a_run_is_exported_for_itself(
         shutil.copytree(onnx, out)
 
     monkeypatch.setattr("mvitac.deploy.export.export", exported)
-    monkeypatch.setattr(
-        "mvitac.deploy.publish.own_data", lambda model, instead: None
-    )  # that of an artifact is not opened
+    monkeypatch.setattr("mvitac.deploy.publish.own_data", lambda *_, **__: None)  # that of an artifact is not opened
     monkeypatch.setenv("MVITAC_CACHE", str(tmp_path / "cache"))
     for model in (artifact, other, artifact):
         assert _engine(str(model), 1).classes.keys() == {"pattern", "bright"}
@@ -487,6 +485,9 @@ def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys:
     assert touched[0]["touch"] == 1 and touched[0]["pattern"]["class"] in ("columns", "rows", "checks")
     assert [line["time"] for line in lines] == sorted({line["time"] for line in lines})
     assert main([*command, "--json", str(tmp_path)]) == 2 and "is a folder" in capsys.readouterr().err
+    refused = ["--record", str(tmp_path / "r"), "--background", *[str(tmp_path / "touch" / "000.png")] * 2]
+    assert main([*command, *refused]) == 2 and "2 background(s)" in capsys.readouterr().err
+    assert not list(tmp_path.glob("r.*"))  # nothing is in the way of the next try
 
 
 # -- values -----------------------------------------------------------------------------------------------------------

@@ -141,6 +141,10 @@ def test_predict_command(
     table = pyarrow.csv.read_csv(out)
     assert table.column_names[:5] == ["frame", "time", "contact", "touch", "pattern"] and table.num_rows == NUM
     assert table.column("contact").to_pylist() == [False] * FREE + [True] * (NUM - FREE)
+    short = write_video(tmp_path / "short.mp4", 12, lambda number: np.zeros((120, 160, 3), np.uint8), rate=12)
+    assert main([*command, "--vision", str(short), *both[2:], "--out", str(out)]) == 0
+    said = capsys.readouterr().err
+    assert "p.csv, 36 frames" in said and "14 frames are left out" in said
     assert main([*command, str(pack.path), "--out", str(out)]) == 0
     assert pyarrow.csv.read_csv(out).num_rows == pack.num
     for m in ("vision", "touch"):

@@ -82,7 +82,8 @@ def export(argv: list[str]) -> None:
     from mvitac.report.tables import text_table
 
     model = load(options.model)
-    pack = Pack(options.on) if options.on else own_data(model, "check the export on a pack, --on PACK")
+    how = "check the export on a pack, --on PACK"
+    pack = Pack(options.on) if options.on else own_data(model, how, few=bool(model.probes))
     pack = as_trained(model, pack)
     with shown():
         calibrate = as_trained(model, Pack(options.calibrate)) if options.calibrate else None

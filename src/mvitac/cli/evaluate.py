@@ -11,6 +11,7 @@ from mvitac.cli.options import check_json, check_models, loading, parse, printed
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
 from mvitac.evaluation.probe_config import ProbeConfig
+from mvitac.shipped import BASE
 from mvitac.system.files import read_json
 from mvitac.system.progress import shown
 
@@ -102,5 +103,6 @@ def report(argv: list[str]) -> None:
     loading()
     from mvitac.report.report import write_report
 
-    out = options.out or (options.runs[0] / "report" if len(options.runs) == 1 else Path("runs") / "report")
+    alone = len(options.runs) == 1 and options.runs != (BASE,)  # nothing is written into the package
+    out = options.out or (options.runs[0] / "report" if alone else Path("runs") / "report")
     print(f"written: {write_report(options.runs, out, result=result, quiet=options.quiet)}")

@@ -4,7 +4,7 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,7 +29,7 @@ from mvitac.live.recorder import Recorder
 from mvitac.live.recordings import TOGETHER, Recordings, pack_tables
 from mvitac.live.streams import CaptureThread, Stream
 from mvitac.registry import to_json
-from mvitac.system.files import cache_dir, check_place, digest, write_atomic, write_json
+from mvitac.system.files import cache_dir, digest, write_atomic, write_json
 from mvitac.system.progress import shown, work
 
 
@@ -90,13 +90,11 @@ def live(argv: list[str]) -> None:
     sensor = options.sensor or next((stream.origin.sensor for stream in streams.get("touch", ())), "")
     if about := about_sensor(engine, sensor):
         _say(about)
-    recorder = None
-    if options.record:
+    more: Any = {"nearest": nearest, "tell": lambda event: _say(event.text), "free": free, "always": options.always}
+    loop, recorder = Live(engine, streams, options.live, **more), None
+    if options.record:  # last, for a refusal must leave no spool
         channels = {m: shape[2] for m, shape in frame_shapes(engine).items()}
-        recorder = Recorder(options.record, channels, sensor=sensor, tell=_say)
-    more: Any = {"nearest": nearest, "record": recorder, "tell": lambda event: _say(event.text)}
-    more |= {"free": free, "always": options.always}
-    loop = Live(engine, streams, options.live, **more)
+        loop.record = recorder = Recorder(options.record, channels, sensor=sensor, tell=_say)
     _run(loop, options.seconds, lambda said: print(json.dumps(said), flush=True))
     _print_summary(loop.summary())
     if options.json:
@@ -178,21 +176,19 @@ def predict(argv: list[str]) -> None:
     files = not options.source or is_recording(options.source)
     if files and bool(options.source) == bool(options.vision or options.touch):
         raise ValueError("give one SOURCE, or those of --vision and --touch")
-    check_place(options.out)
+    check_json(options.out, "--out")
     free = [np.array(decode(file)) for file in options.background]
     given = {"vision": (options.vision,) if options.vision else (), "touch": options.touch}
-    engine = _engine(options.model, options.threads, tuple(m for m in given if given[m] and files))
+    opened = {m: [recording(text) for text in texts] for m, texts in given.items() if texts and files}
+    single = [recording(options.source)] if options.source and files else []
+    engine = _engine(options.model, options.threads, tuple(opened), most=1 if single else 2)
     if not (engine.classes or engine.values):
         raise ValueError(f"{options.model} has no probes of classes or values: export it on data that has labels")
     if options.source and not files:
         pack = _opened(options.source, given, next(iter(engine.inputs.values()))[0])
         _write(options.out, pack_tables(engine, pack), pack.num)
         return
-    if options.source:
-        if len(engine.inputs) > 1:
-            raise ValueError("the model takes vision and touch: give --vision SOURCE, --touch SOURCE, or both")
-        given = dict.fromkeys(engine.inputs, (options.source,))
-    opened = {m: [recording(text) for text in texts] for m, texts in given.items() if texts}
+    opened = dict.fromkeys(engine.inputs, single) if single else opened
     recordings = Recordings(engine, opened, options.live, free)
     _write(options.out, recordings.tables(), recordings.num)
     if num := recordings.left_out:
@@ -212,19 +208,23 @@ def _opened(source: str, names: Mapping[str, Sequence[str]], side: int) -> Pack:
 
 
 def _write(out: Path, tables: Iterator[dict[str, Any]], num: int) -> None:
-    """Write ``tables`` of ``num`` rows in all as CSV, and say how fast they came."""
-    start = time.monotonic()
+    """Write ``tables``, of at most ``num`` rows in all, as CSV, and say how many there are and how fast they came."""
+    start, written = time.monotonic(), 0
 
     def write(file: Any) -> None:
+        nonlocal written
         made: list[CSVWriter] = []
         with shown(), work("predicting", num, "frames") as advance, ExitStack() as stack:
             for table in map(pa.table, tables):
                 made = made or [stack.enter_context(CSVWriter(file, table.schema))]
                 made[0].write_table(table)
+                written += table.num_rows
                 advance(table.num_rows)
+        if not written:
+            raise ValueError("no frame has every image that the model takes: nothing is written")
 
     write_atomic(out, write)
-    _say(f"written: {out}, {num} frames, {num / (time.monotonic() - start):.0f} a second")
+    _say(f"written: {out}, {written} frames, {written / (time.monotonic() - start):.0f} a second")
 
 
 def sources(
@@ -246,10 +246,19 @@ def sources(
     return given
 
 
-def _engine(model: str, threads: int, modalities: tuple[Any, ...] = ()) -> Engine:
-    """The engine of an export; a run or an artifact is exported first, once, into the cache, with these inputs."""
+def _engine(model: str, threads: int, modalities: tuple[Any, ...] = (), *, most: int = 2) -> Engine:
+    """The engine of an export; a run or an artifact is exported first, once, into the cache, with these inputs.
+
+    ValueError if it has more than ``most`` inputs.
+    """
+
+    def check(inputs: Collection[str]) -> None:
+        if len(inputs) > most:
+            raise ValueError("the model takes vision and touch: give --vision SOURCE, --touch SOURCE, or both")
+
     if (Path(model) / EXPORT.name).is_file():
-        return Engine(model, threads=threads)
+        check((engine := Engine(model, threads=threads)).inputs)
+        return engine
     check_models(model)
     loading()
     from mvitac.deploy.artifact import load
@@ -258,13 +267,15 @@ def _engine(model: str, threads: int, modalities: tuple[Any, ...] = ()) -> Engin
     from mvitac.nn.weights import safetensors_digest
 
     loaded = load(model)
+    check(modalities or loaded.encoders)  # before the export, which takes longer
     # Artifacts of one run differ in their probes only. A run has none: its data decides those that are fitted below.
     probes = [[to_json(r.info), safetensors_digest(dict(r.state_dict()))] for r in loaded.probes.values()]
     key = digest([EXPORT.version, loaded.weights_digest(), probes, *modalities])
     folder = cache_dir() / "exports" / key[:32]
     if not folder.exists():
         _say(f"exporting {model}, once")
-        pack = own_data(loaded, "`mvitac export MODEL --on PACK --out DIR` first, and give DIR")
+        how = "`mvitac export MODEL --on PACK --out DIR` first, and give DIR"
+        pack = own_data(loaded, how, few=bool(loaded.probes))
         with shown():
             export(with_probes(loaded, pack), pack, folder, ExportConfig(modalities=modalities))
     return Engine(folder, threads=threads)

@@ -10,6 +10,7 @@ import torch
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, ValueTask
+from mvitac.datasets.simulated import SimulatedConfig
 from mvitac.deploy.artifact import ARTIFACT, HUB_ID, preprocessing, read
 from mvitac.deploy.card import card
 from mvitac.evaluation.controls import Records, controls_of
@@ -30,6 +31,7 @@ from mvitac.system.files import brief, write_atomic, write_json
 from mvitac.system.locks import new_folder
 from mvitac.system.progress import work
 
+NUM_SIMULATED = 1000  # 400 test rows of ``materials`` with two sensors per press
 NUM_RANGES, RANGE_ROWS = 8, 20
 """Most ranges of a predicted value that have an error of their own, and fewest test rows in one."""
 
@@ -120,9 +122,15 @@ def _controls(model: Model, pack: Pack, records: Records) -> Records:
     return controls
 
 
-def own_data(model: Model, instead: str) -> Pack:
-    """The data ``model`` was trained on; the ValueError where it cannot be opened ends with ``instead``, what to do."""
+def own_data(model: Model, instead: str, *, few: bool = False) -> Pack:
+    """The data ``model`` was trained on; the ValueError where it cannot be opened ends with ``instead``, what to do.
+
+    ``few``: of simulated data, which may have to be made first, only the first ``NUM_SIMULATED`` items. Splits are the same.
+    """
+    data = model.run.data
     try:
+        if few and isinstance(data, SimulatedConfig):
+            return replace(data, num=min(data.num, NUM_SIMULATED)).open()
         return model.open_data()
     except ValueError as error:
         raise ValueError(f"the data this model was trained on is not here ({brief(error)}): {instead}") from None

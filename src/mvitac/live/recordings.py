@@ -125,7 +125,7 @@ class Recordings:
         while batch := list(islice(rows, BATCH)):
             yield tuple(zip(*batch, strict=True))
 
-    def _rows(self) -> Iterator[tuple[int, float, bool | None, int, dict[str, np.ndarray] | None]]:
+    def _rows(self) -> Iterator[tuple[int, float, bool | None, int, dict[str, np.ndarray]]]:
         """Number, time, contact and touch of each frame, and what the model gets of it."""
         leading = self.live.leading
         for number, time in enumerate(self.files[leading].times.tolist()):
@@ -135,12 +135,13 @@ class Recordings:
                         stream.take(file.read())
             newest = {m: [stream.newest() for stream in several] for m, several in self.live.streams.items()}
             apart = [abs(f.time - time) if f else np.inf for several in newest.values() for f in several]
-            found = leading.newest()
-            if max(apart) > TOGETHER or found is None or found.time != time:
+            found, given = leading.newest(), None
+            if max(apart) <= TOGETHER and found and found.time == time:
+                self.live.remember()
+                _, given = self.live.see(newest)  # type: ignore[arg-type]
+            if given is None:  # also a sensor whose images change in size, until its background is known again
                 self.left_out += 1
                 continue
-            self.live.remember()
-            _, given = self.live.see(newest)  # type: ignore[arg-type]
             yield number, time, self.live.contact, self.live.num_touches, given
 
 

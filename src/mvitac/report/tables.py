@@ -1,5 +1,6 @@
 """Probe results as tables for a terminal 80 columns wide, and the rows that every table of results shares."""
 
+import re
 import textwrap
 from collections.abc import Iterator, Sequence
 from typing import Any, TextIO
@@ -184,7 +185,9 @@ def print_finetuning(result: dict[str, Any], file: TextIO | None = None) -> None
         print(text_table(f"{result['data']}: {task}", columns, rows), file=file)
         last = [*ours][-1]  # the models that are published
         if any(s.startswith("frozen") and paired_difference(ours[last], found[last])[2] < 0 for s, found in others):
-            advice = f"use the frozen probe of {result['ancestor']} instead, with `mvitac publish --on PACK`"
+            advice = f"use the frozen probe of {result['ancestor']} instead"
+            if not re.match("imagenet|.*=", result["ancestor"]):  # not of a run
+                advice += ", with `mvitac publish --on PACK`"
             print(f"{task}: fine-tuning lost against the frozen probe; {advice}", file=file)
     _print_notes(result, result["records"], file)
 

@@ -33,9 +33,8 @@ class Step:
     def __init__(self, run: Run, method: Method, device: torch.device, world: World | None = None) -> None:
         self.method, self.device, self.world, self.bf16 = method, device, world or World(), run.bf16
         if self.world.size > 1 and device.type == "cuda":  # torch has none for CPUs
-            convert_sync_batchnorm(
-                method
-            )  # timm's, as torch's own drops the activation that timm puts into some layers
+            # timm's function, because torch's drops the activation that timm puts into some layers.
+            convert_sync_batchnorm(method)
         self.optimiser = build_optimiser(run.optim, method, run.encoder)
         if (run.chunk or self.world.size > 1) and not isinstance(method, Contrastive):
             raise ValueError(f"method {run.method.name!r} supports neither several processes nor --chunk")
