@@ -4,7 +4,7 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -252,8 +252,8 @@ def _engine(model: str, threads: int, modalities: tuple[Any, ...] = (), *, most:
     ValueError if it has more than ``most`` inputs.
     """
 
-    def check(inputs: Collection[str]) -> None:
-        if len(inputs) > most:
+    def check(inputs: Iterable[str]) -> None:
+        if len([*inputs]) > most:
             raise ValueError("the model takes vision and touch: give --vision SOURCE, --touch SOURCE, or both")
 
     if (Path(model) / EXPORT.name).is_file():

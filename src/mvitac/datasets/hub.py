@@ -42,8 +42,9 @@ class HubConfig(RowsConfig):
             images = _read(file, rows, found, self.vectors())
             if not images:
                 raise ValueError(f"{file} has no image column (struct<bytes, path> or binary): is it the right file?")
-            for row in rows[before:] if side else ():
-                row.setdefault("split", side)
+            if side:
+                for row in rows[before:]:
+                    row.setdefault("split", side)
         for column, places in found.items():
             if len(places) < len(rows):
                 raise ValueError(f"{self.path}: image column {column!r} is not in every file")

@@ -11,7 +11,7 @@ its running statistics are updated once per chunk.
 from collections.abc import Callable, Sequence
 
 import torch
-from timm.layers import convert_sync_batchnorm
+from timm.layers.norm_act import convert_sync_batchnorm
 from timm.optim import param_groups_layer_decay  # pyright: ignore[reportPrivateImportUsage]
 from torch import Tensor
 
