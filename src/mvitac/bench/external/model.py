@@ -104,7 +104,7 @@ class ExternalModel(Model):
             raise ValueError(f"{self.text} reads {senses}: give reads=touch, vision or both")
         notes = []
         wants = {m: part.preprocessing for m, part in parts.items()}
-        moving = {m: want for m, want in wants.items() if want.frames > 1 and not want.still}
+        moving = {m: want for m, want in wants.items() if want.frames > 1}
         if moving and not pack.spec.window.active:
             try:
                 if len(asked := {(want.frames, want.stride) for want in moving.values()}) > 1:

@@ -1,42 +1,40 @@
-"""Encoders of owners who publish touch encoders or the code that trains them, from their checkpoints.
+"""Touch encoders whose owners publish them under a stated licence, from their checkpoints, as timm's vision transformers.
 
-No owner's code is used, and no owner's weights were at hand: the adapters are tested on small weights with the owners'
-names and shapes, which were read, as the preprocessing, from
+No owner's weights were at hand: the adapters are tested on small weights with the owners' names and shapes, which were
+read, as the preprocessing, from
 
-    Sparsh            facebookresearch/sparsh @fee6a05, huggingface.co/facebook/sparsh-*
-    T3                alanzjl/t3 @341177f, huggingface.co/datasets/alanz-mit/FoundationTactile
-    AnyTouch, 2       GeWu-Lab/AnyTouch @9c43a1a, GeWu-Lab/AnyTouch2 @d8a1147
-    UniTouch          cfeng16/UniTouch @00d1bdc
-    TVL               Max-Fu/tvl @f489503, huggingface.co/mlfu7/Touch-Vision-Language-Models
+    Sparsh    facebookresearch/sparsh @fee6a05, huggingface.co/facebook/sparsh-*
+    T3        alanzjl/t3 @341177f, huggingface.co/datasets/alanz-mit/FoundationTactile
+    TVL       Max-Fu/tvl @f489503, huggingface.co/mlfu7/Touch-Vision-Language-Models
 """
 
+import math
 import re
 from abc import abstractmethod
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
-from timm.layers.mlp import Mlp
+import torch.nn.functional as F
+from timm.models.vision_transformer import VisionTransformer
 from torch import Tensor, nn
 
-from mvitac.bench.external.base import START, UNKNOWN, Adapter, Loaded
-from mvitac.bench.external.preprocessing import CLIP, IMAGENET, PLAIN, Preprocessing, Three
-from mvitac.bench.external.tower import HEAD, Tower, depth, fill, from_clip, patches, read_tensors, tower, under
-from mvitac.nn.weights import State
+from mvitac.bench.external.base import START, Adapter, Loaded
+from mvitac.bench.external.preprocessing import IMAGENET, PLAIN, Preprocessing, Three
+from mvitac.nn.weights import State, misfit, read_tensors
 from mvitac.system.files import brief
 
-VIT = {"cls_token": "front", "pos_embed": "positions", "patch_embed.proj": "embed"}
-"""Names of timm's ViT -> those of ``Tower``."""
-Built = tuple[nn.Module, Preprocessing, str]  # network, its preprocessing, what follows the owner's name in tables
+Built = tuple[
+    VisionTransformer, Preprocessing, str
+]  # network, its preprocessing, what follows the owner's name in tables
 
 
 @dataclass(frozen=True, kw_only=True)
 class Owner(Adapter):
     """Base of the adapters below: what is known of an owner's files, and the network that their tensors make."""
 
-    about: ClassVar[tuple[str, str, str]]  # name in tables, where the weights or the code are, licence of the weights
+    about: ClassVar[tuple[str, str, str]]  # name in tables, where the weights are, their licence
 
     @abstractmethod
     def build(self, *tensors: State) -> Built:
@@ -54,43 +52,69 @@ class Owner(Adapter):
             why = f"no {brief(error)}" if isinstance(error, KeyError) else brief(error)
             raise ValueError(f"{self.place} is not for {START}{self.name} ({why}): give {self.expects}") from None
         owner, source, licence = self.about
-        title = f"{owner} {variant}".strip()
-        return Loaded(network, made, title, files=files, licence=licence, source=source)
+        return Loaded(network, made, f"{owner} {variant}", files=files, licence=licence, source=source)
+
+    def square(self, tensors: State, **options: Any) -> VisionTransformer:
+        """The transformer of ``tensors`` with learned positions over a square grid, at the size that is asked for."""
+        grid = math.isqrt(tensors["pos_embed"].shape[1])
+        side = grid * tensors["patch_embed.proj.weight"].shape[-1]
+        network = transformer(tensors, img_size=side, **options)
+        network.set_input_size(self.sides((side, side)))
+        return network
+
+
+def transformer(tensors: State, **options: Any) -> VisionTransformer:
+    """timm's vision transformer with exactly ``tensors`` as its weights, from which its width and depth are taken."""
+    width, channels, patch, _ = tensors["patch_embed.proj.weight"].shape
+    depth = 1 + max((int(name.split(".")[1]) for name in tensors if name.startswith("blocks.")), default=-1)
+    heads = max(1, width // 64)  # as in ViT-Ti, S, B and L
+    about = {"patch_size": patch, "in_chans": channels, "embed_dim": width, "depth": depth, "num_heads": heads}
+    network = VisionTransformer(**about, num_classes=options.pop("num_classes", 0), **options)
+    if why := misfit(network.state_dict(), tensors):
+        raise ValueError(why)
+    network.load_state_dict(tensors)
+    return network
 
 
 class Sparsh(Owner):
-    """MAE, DINO, DINOv2, I-JEPA (a frame and the one five before it) and V-JEPA (four frames). Non-commercial.
+    """MAE, DINO, DINOv2 and I-JEPA: a frame and the one five before it. Non-commercial.
 
-    The configs of I-JEPA and V-JEPA set no register, but the files have one: the file decides.
+    The configs of I-JEPA set no register, but the files have one: the file decides.
     """
 
     name: ClassVar[str] = "sparsh"
-    expects: ClassVar[str] = "a {method}_vit{small,base}.safetensors of huggingface.co/facebook/sparsh-*, not the .ckpt"
+    expects: ClassVar[str] = "a {mae,dino,dinov2,ijepa}_vit{small,base}.safetensors of huggingface.co/facebook/sparsh-*"
     about: ClassVar = ("Sparsh", "https://github.com/facebookresearch/sparsh", "CC-BY-NC-4.0")
 
     def build(self, *tensors: State) -> Built:
-        own = under(tensors[0], "", {"patch_embed.proj": "embed", "register_tokens": "front"})
+        own = {name.replace("register_tokens", "reg_token"): value for name, value in tensors[0].items()}
         bands = own.pop("pos_embed.frequency_bands")
-        width, channels, *kernel = own["embed.weight"].shape
-        video = len(kernel) == 3
+        _, channels, patch, _ = own["patch_embed.proj.weight"].shape
         made = Preprocessing(  # the encoders of force fields take 224x224
-            size=(320, 240), mean=PLAIN[0], std=PLAIN[1], offset=0.5, whole_levels=True, portrait=True
+            size=(320, 240),
+            mean=PLAIN[0],
+            std=PLAIN[1],
+            frames=channels // 3,
+            stride=5,
+            offset=0.5,
+            whole_levels=True,
+            portrait=True,
         )
-        if video:
-            made = replace(made, frames=4, stride=2, layout="video")
-        else:
-            made = replace(made, frames=channels // 3, stride=5)
-        grid = (made.frames // kernel[0] if video else 1, *patches(self.sides(made.size), kernel[-1]))
-        fixed = sines(bands, grid if video else grid[1:], width)
-        network = fill(Tower(own, grid, placed=0, fixed=fixed, mean=True), own)
+        size = self.sides(made.size)
+        own["pos_embed"] = sines(bands, (size[0] // patch, size[1] // patch))
+        registers = own["reg_token"].shape[1] if "reg_token" in own else 0
+        options = {"img_size": size, "class_token": False, "reg_tokens": registers, "no_embed_class": True}
+        network = transformer(own, **options, global_pool="avg", fc_norm=False, init_values=1.0)
+        del network.pos_embed  # computed: no weights
+        network.register_buffer("pos_embed", own["pos_embed"])
         return network, made, self.path().stem.removeprefix("sparsh_")
 
 
-def sines(bands: Tensor, grid: tuple[int, ...], width: int) -> Tensor:
-    """Positions [1, places, width]: for each axis the sines, then the cosines, of place x ``bands`` [axes, bands]."""
+def sines(bands: Tensor, grid: tuple[int, int]) -> Tensor:
+    """Positions [1, places, D]: for row, then column, the sines, then the cosines, of place x ``bands`` [2, D / 4]."""
     axes = torch.meshgrid(*(torch.arange(n, dtype=torch.float32) for n in grid), indexing="ij")
     phases = torch.stack(axes, -1).flatten(0, -2)[:, :, None] * bands.float()
-    return torch.cat([phases.sin(), phases.cos()], dim=2).flatten(1)[None, :, :width]
+    return torch.cat([phases.sin(), phases.cos()], dim=2).flatten(1)[None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,13 +137,13 @@ class T3(Owner):
         return (self.path() / "encoders" / f"{self.sensor}.pth", self.path() / "trunk.pth")
 
     def build(self, *tensors: State) -> Built:
-        own = under(tensors[0], "", VIT)
-        first = depth(own)
+        own = dict(tensors[0])
+        first = 1 + max(int(name.split(".")[1]) for name in own if name.startswith("blocks."))
         for name, value in tensors[1].items():
             number = re.match(r"blocks\.(\d+)\.", name)
             own[name.replace(number[0], f"blocks.{first + int(number[1])}.") if number else name] = value
-        network = tower(own, self.sides)
-        for norm in (m for part in (*network.blocks[first:], network.norm) for m in part.modules()):
+        network = self.square(own)
+        for norm in (m for part in (network.blocks[first:], network.norm) for m in part.modules()):
             if isinstance(norm, nn.LayerNorm):
                 norm.eps = 1e-5
         mean, std = self.statistics.get(self.sensor, IMAGENET)
@@ -127,96 +151,8 @@ class T3(Owner):
         return network, made, f"{self.path().name.removeprefix('t3_')} {self.sensor}"
 
 
-@dataclass(frozen=True, kw_only=True)
-class AnyTouch(Owner):
-    """A transformer of CLIP with tokens that name the sensor.
-
-    Its convolution in three dimensions takes [B, frame, colour, H, W]: its channels are frames and its depth is colour.
-    The 2-D ``embeddings.patch_embedding`` of that file is not used.
-    """
-
-    name: ClassVar[str] = "anytouch"
-    expects: ClassVar[str] = "checkpoint.pth of AnyTouch"
-    about: ClassVar = ("AnyTouch", "https://github.com/GeWu-Lab/AnyTouch", UNKNOWN)
-    sensor: int = -1
-    """0 GelSight, 1 DIGIT, 2 GelSlim, 3 GelSight Mini, 4 DuraGel, 5 ObjectFolder 2, -1 any sensor."""
-
-    def build(self, *tensors: State) -> Built:
-        own = under(tensors[0], "touch_mae_model.")
-        embed = own["video_patch_embedding.weight"]
-        network = self.tower(own, embed, 1)
-        return network, Preprocessing(size=network.size, frames=embed.shape[1], still=True, layout="frames"), ""
-
-    def tower(self, tensors: State, embed: Tensor, time: int) -> Tower:
-        """The transformer of ``tensors``, with patch embedding ``embed`` over ``time`` steps."""
-        names = {
-            "embeddings.position_embedding.weight": "positions",
-            "pre_layrnorm": "pre_norm",  # the owner's spelling
-            "post_layernorm": "head.0",
-        }
-        own = from_clip(under(tensors, "touch_model.", names))
-        cls = own["embeddings.class_embedding"][None]
-        front, positions = torch.cat([cls, tensors["sensor_token"][self.sensor]])[None], own["positions"][None]
-        own = {name: value for name, value in own.items() if not name.startswith("embeddings.")}
-        own |= {"embed.weight": embed, "head.1.weight": tensors["touch_projection.weight"]}
-        return tower(own | {"front": front, "positions": positions}, self.sides, time=time, eps=1e-5, head=True)
-
-
-class AnyTouch2(AnyTouch):
-    """Distance of frames (stride): Touch and Go 1, force of DIGIT 2."""
-
-    name: ClassVar[str] = "anytouch2"
-    expects: ClassVar[str] = "checkpoint-4frames.pth of AnyTouch 2, or checkpoint-2frames.pth with frames=2"
-    about: ClassVar = ("AnyTouch 2", "https://github.com/GeWu-Lab/AnyTouch2", UNKNOWN)
-
-    def build(self, *tensors: State) -> Built:
-        own, frames = under(tensors[0], "touch_mae_model."), self.frames or 4
-        embed = own["touch_model.embeddings.patch_embedding.weight"]
-        network = self.tower(own, embed, max(1, frames // embed.shape[2]))
-        made = Preprocessing(
-            mean=CLIP[0], std=CLIP[1], frames=frames, oldest_first=True, layout="video", offset=130 / 255
-        )
-        return network, replace(made, size=network.size), ""
-
-
-class UniTouch(Owner):
-    """The touch tower of an ImageBind model, whose code's licence is named, as that of the weights was not found.
-
-    Its attention has one learned key and value more than tokens, and tokens are not normalised before the first block.
-    """
-
-    name: ClassVar[str] = "unitouch"
-    expects: ClassVar[str] = "last_new.ckpt of huggingface.co/chfeng/Touch-LLM"
-    about: ClassVar = ("UniTouch", "https://github.com/cfeng16/UniTouch", "CC-BY-NC-SA-4.0")
-
-    def build(self, *tensors: State) -> Built:
-        names = {"cls_token": "front", "rgbt_stem.proj.1": "embed", "pos_embedding_helper.pos_embed": "positions"}
-        own = under(tensors[0], "modality_preprocessors.touch.", names)
-        own |= under(tensors[0], "modality_trunks.touch.")
-        own |= under(tensors[0], "modality_heads.touch.", {"0": "head.0", "2": "head.1"})
-        width, _, frames, *_ = own["embed.weight"].shape
-        network = tower(own, self.sides, head=True, scale=5.0, block=partial(BiasedBlock, width))
-        made = Preprocessing(mean=CLIP[0], std=CLIP[1], frames=frames, still=True, layout="video", bicubic=True)
-        return network, replace(made, size=network.size, shorter=network.size[0]), ""
-
-
-class BiasedBlock(nn.Module):
-    """A transformer block whose attention has a learned key and value beside those of the tokens."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.norm_1, self.norm_2 = nn.LayerNorm(width, eps=1e-6), nn.LayerNorm(width, eps=1e-6)
-        self.attn = nn.MultiheadAttention(width, max(1, width // HEAD), add_bias_kv=True, batch_first=True)
-        self.mlp = Mlp(width, 4 * width)
-
-    def forward(self, x: Tensor) -> Tensor:
-        z = self.norm_1(x)
-        x = x + self.attn(z, z, z, need_weights=False)[0]
-        return x + self.mlp(self.norm_2(x))
-
-
 class TVL(Owner):
-    """timm's ViT with a head into the space of CLIP."""
+    """timm's ViT with a head into the space of CLIP, where features have unit length."""
 
     name: ClassVar[str] = "tvl"
     expects: ClassVar[str] = "tvl_enc_{vittiny,vits,vitb}.pth of huggingface.co/mlfu7/Touch-Vision-Language-Models"
@@ -230,8 +166,17 @@ class TVL(Owner):
         file = self.path()
         if "bgs" in file.stem and not (self.mean and self.std):
             raise ValueError("it was trained minus a background, with its own statistics: give mean=..., std=...")
-        own = under(tensors[0], "tactile_encoder.", {**VIT, "head": "head.1", "fc_norm": "head.0"})
-        network = tower(own, self.sides, mean=True, head=True, scale=1.0)
+        start = "model.tactile_encoder."
+        own = {name.removeprefix(start): value for name, value in tensors[0].items() if name.startswith(start)}
+        network = self.square(own, global_pool="avg", num_classes=len(own["head.weight"]))
+        network.head = nn.Sequential(network.head, Unit())
         mean, std = (0.2917, 0.2971, 0.2910), (0.1876, 0.1947, 0.2187)
-        made = Preprocessing(size=network.size, mean=mean, std=std, pad=True)
+        made = Preprocessing(size=network.patch_embed.img_size, mean=mean, std=std, pad=True)
         return network, made, file.stem.removeprefix("tvl_enc_")
+
+
+class Unit(nn.Module):
+    """Features of length 1."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.normalize(x, dim=1)

@@ -5,7 +5,6 @@ Shapes: N images, F frames (newest first), H x W pixels.
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -30,14 +29,9 @@ class Preprocessing:
     mean: Three = IMAGENET[0]
     std: Three = IMAGENET[1]
     frames: int = 1
-    """Frames that the network sees at once."""
+    """Frames that the network sees at once, stacked on channels: [N, 3 F, H, W]."""
     stride: float = 1.0
     """Distance of two frames, in units of the data's order column."""
-    still: bool = False
-    """Whether all frames are the current one."""
-    oldest_first: bool = False
-    layout: Literal["channels", "video", "frames"] = "channels"
-    """Input of several frames. channels: [N, 3 F, H, W]. video: [N, 3, F, H, W]. frames: [N, F, 3, H, W]."""
     offset: float | None = None
     """If given, difference images become clip(image - background + offset, 0, 1). Other images stay as they are."""
     whole_levels: bool = False
@@ -49,7 +43,6 @@ class Preprocessing:
     """First pad images with zeros to a square and rotate them by 90 degrees anticlockwise."""
     shorter: int | None = None
     """Resize the shorter side to this, then cut out the centre. None: resize to ``size``, ignoring the aspect ratio."""
-    bicubic: bool = False
 
     def __post_init__(self) -> None:
         check_range(self, 0, 1, *["offset"] * (self.offset is not None))
@@ -63,7 +56,7 @@ class Preprocessing:
 
     def input_shape(self) -> tuple[int, ...]:
         """Shape of the network's input, for one image."""
-        return self._laid_out(torch.zeros(1, self.frames, 3, 1, 1)).shape[1:-2] + self.size
+        return (3 * self.frames, *self.size)
 
     def __call__(self, images: Tensor, gain: float = 0.0) -> Tensor:
         """Prepare images [N, F, 3, H, W], uint8 or float in [0, 1], newest first.
@@ -71,15 +64,14 @@ class Preprocessing:
         Missing older frames are the oldest there is; further ones are left out. For difference images ``gain`` undoes
         their scale; it is 0 for plain images.
         """
-        last = 0 if self.still else images.shape[1] - 1
-        images = images[:, [min(f, last) for f in range(self.frames)]]
+        images = images[:, [min(f, images.shape[1] - 1) for f in range(self.frames)]]
         x = images.float() / 255 if images.dtype == torch.uint8 else images.float()
         if gain and self.offset is not None:
             x = ((x - NO_CONTACT) * gain + self.offset).clamp(0, 1)
             x = (x * 255 + 1e-4).floor() / 255 if self.whole_levels else x
         x = self._fitted(x.flatten(0, 1)).unflatten(0, images.shape[:2])
         mean, std = (x.new_tensor(values).view(3, 1, 1) for values in (self.mean, self.std))
-        return self._laid_out((x - mean) / std)
+        return ((x - mean) / std).flatten(1, 2)
 
     def _fitted(self, x: Tensor) -> Tensor:
         """Rotate, cut and resize [N, 3, H, W] to ``size``."""
@@ -94,20 +86,9 @@ class Preprocessing:
             top, left = (side - height) // 2, (side - width) // 2
             x = F.pad(x, (left, side - width - left, top, side - height - top)).rot90(1, (2, 3))
         if self.shorter is None:
-            return self._resized(x, self.size)
+            return F.interpolate(x, self.size, mode="bilinear", antialias=True)
         scale = self.shorter / min(x.shape[-2:])
-        x = self._resized(x, (max(self.size[0], int(x.shape[2] * scale)), max(self.size[1], int(x.shape[3] * scale))))
+        large = (max(want, int(have * scale)) for want, have in zip(self.size, x.shape[-2:], strict=True))
+        x = F.interpolate(x, tuple(large), mode="bilinear", antialias=True)
         top, left = (round((have - want) / 2) for have, want in zip(x.shape[-2:], self.size, strict=True))
         return x[:, :, top : top + self.size[0], left : left + self.size[1]]
-
-    def _resized(self, x: Tensor, size: tuple[int, int]) -> Tensor:
-        if x.shape[-2:] == size:
-            return x
-        return F.interpolate(x, size, mode="bicubic" if self.bicubic else "bilinear", antialias=True)
-
-    def _laid_out(self, x: Tensor) -> Tensor:
-        """[N, F, 3, H, W], newest first, in ``layout``."""
-        x = x.flip(1) if self.oldest_first else x
-        if self.layout == "channels":
-            return x.flatten(1, 2)
-        return x.transpose(1, 2) if self.layout == "video" else x
