@@ -169,7 +169,7 @@ class TVL(Owner):
         start = "model.tactile_encoder."
         own = {name.removeprefix(start): value for name, value in tensors[0].items() if name.startswith(start)}
         network = self.square(own, global_pool="avg", num_classes=len(own["head.weight"]))
-        network.head = nn.Sequential(network.head, Unit())
+        network.head = nn.Sequential(network.head, Unit())  # type: ignore[assignment]
         mean, std = (0.2917, 0.2971, 0.2910), (0.1876, 0.1947, 0.2187)
         made = Preprocessing(size=network.patch_embed.img_size, mean=mean, std=std, pad=True)
         return network, made, file.stem.removeprefix("tvl_enc_")
