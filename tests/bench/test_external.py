@@ -29,15 +29,9 @@ from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import features
 from mvitac.evaluation.probe import probe_model
 from mvitac.evaluation.retrieval import cross_modal
-from mvitac.experiments.collect import gather, lay_out
-from mvitac.experiments.jobs import do
-from mvitac.experiments.plan import Row
-from mvitac.experiments.table import lines_of
-from mvitac.experiments.table_formats import markdown
 from mvitac.model_files import fresh
 from mvitac.recipes import recipe
 from support.owners import OWNERS, tvl
-from support.small_plans import ROWS, small
 from support.toy import toy_pack
 
 
@@ -417,31 +411,6 @@ def test_an_encoder_is_probed_beside_a_run(smoke_run: Path, pack: Pack) -> None:
             probe_runs([smoke_run], config, pack, **bad)
     with pytest.raises(ValueError, match="--on PACK"):
         probe_runs([], config, encoders=[TINY])
-
-
-def test_a_plan_has_rows_of_encoders(pack: Pack, tmp_path: Path) -> None:
-    encoder = f"external:{onnx_mean(tmp_path / 'mean.onnx')},licence=CC-BY-NC-4.0,trained-on=photos,reads=touch"
-    row = Row(label="theirs", encoder=encoder)
-    plan = small(pack, rows=(ROWS[0], row, Row(label="lost", encoder="external:none.onnx")), seeds=1)
-    config = ProbeConfig(tasks=("pattern",), controls=False)
-    work = lay_out(plan, pack, tmp_path, config)
-    assert [job.label for job in work.jobs] == ["MViTac"] and "does not exist" in work.left_out["lost"]
-    do(work.jobs[0], pack)
-    result = gather(work, tmp_path, config)
-    lines = [line for line in lines_of(result) if line.source == "theirs (NC)"]
-    assert [line.modality for line in lines] == ["touch"] and lines[0].cells["pattern"]["difference"] is not None
-    text = markdown(result, lines_of(result))
-    assert "| theirs (NC) |" in text and "licence CC-BY-NC-4.0, no commercial use" in text
-    kept = (tmp_path / "encoders.json").read_bytes()
-    assert (
-        gather(work, tmp_path, config)["records"] == result["records"]
-        and (tmp_path / "encoders.json").read_bytes() == kept
-    )
-    for bad in ({"method": "simclr"}, {"set": {"steps": 2}}):
-        with pytest.raises(ValueError, match="not trained"):
-            Row(label="x", encoder=TINY, **bad)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="choose a row that is trained"):
-        small(pack, rows=(row,), reference="theirs")
 
 
 def test_non_commercial_licences() -> None:

@@ -36,7 +36,7 @@ from mvitac.experiments.collect import cost, gather, lay_out, leaks, pairs_of
 from mvitac.experiments.cross_validation import lay_out_folds
 from mvitac.experiments.jobs import do_all
 from mvitac.experiments.plan import PLANS, Plan, Row, changed, find_plan, setting, slug
-from mvitac.experiments.table import Line, as_printed, lines_of
+from mvitac.experiments.table import as_printed, lines_of
 from mvitac.experiments.table_formats import _tabular, comma, latex, markdown, write_tables
 from mvitac.recipes import RECIPES, recipe
 from mvitac.registry import from_json
@@ -250,7 +250,7 @@ def test_result_and_tables_agree(done: tuple[Path, dict]) -> None:
     found = next(r for r in rows if (r["row"], r["modality"], r["task"]) == ("colder", "both", "bright"))
     assert float(found["accuracy"]) == lines["colder", "both"].cells["bright"]["mean"]
     tex = (out / "table.tex").read_text()
-    assert tex.count(r"\\") == len(lines) + 1 and "(57.6)" not in tex
+    assert tex.count(r"\\") == len(lines) + 1 and "printed" not in tex and r"\textit{pixels}" in tex
     assert json.loads((out / "result.json").read_text())["rows"] == ["MViTac", "colder", "supervised, touch"]
 
 
@@ -288,7 +288,7 @@ def test_printed_numbers_stand_beside_the_same_split_probe_and_positives(
         **({("majority", "pattern"): 18.6 / 100} if same else {}),
     }
     text = markdown(result, lines)
-    assert ("57.6" in text) == ("(57.6)" in latex(result, lines)) == ("0.576" in comma(result)) == shown
+    assert ("57.6" in text) == ("57.6" in latex(result, lines)) == ("0.576" in comma(result)) == shown
     assert ("by the same probe and positives" in text) == same
     assert ("`--probes paper` shows them" in text) == (probe == "linear")
 
@@ -505,10 +505,9 @@ def test_what_must_be_said_beside_every_result_is(done: tuple[Path, dict], pack:
 
 
 def test_names_and_units_are_text_in_latex_and_markdown() -> None:
-    cell = {"mean": 0.5, "low": 0.4, "high": 0.6, "printed": None}
-    text = _tabular([Line("\\input{x} N%$_^~", "touch", {"a & b": cell}, control=False)])
-    assert r"\textbackslash{}input\{x\} N\%\$\_\^{}\textasciitilde{}" in text and r"a \& b (\%)" in text
-    assert r"\textbf{50.0} [40.0, 60.0]" in text
+    text = _tabular(["", "modality", "a & b %"], [["\\input{x} N%$_^~", "touch", "50.0 [40.0, 60.0]"]])
+    assert r"\textbackslash{}input\{x\} N\%\$\_\^{}\textasciitilde{}" in text and r"a \& b \%" in text
+    assert r"50.0 [40.0, 60.0]" in text
     assert pipes(["a|b"], [["c|d"]], words=1) == [r"| a\|b |", "|---|", r"| c\|d |", ""]
 
 

@@ -347,7 +347,7 @@ def test_report_and_comparison_give_one_text_for_one_score(materials: Path, resu
     whole = {**result, **kept, "plan": to_json(plan), "rows": ["mvitac"]}
     html = (materials / "out" / "report.html").read_text()
     page, drawn, lines = Page(html).text, "".join(drawings(html)), lines_of(whole)
-    tex = latex(whole, lines).replace(r"\textbf{", "").replace("}", "")
+    tex = latex(whole, lines)
     for cell, text in texts_of(result["records"]).items():
         for shown in (page.replace("\xa0", " "), markdown(whole, lines), tex):
             assert text in shown, cell

@@ -143,7 +143,7 @@ def test_one_test_group_of_values_alone(tmp_path: Path) -> None:
 def compared(result: dict[str, Any]) -> dict[str, Any]:
     """``result`` as that of a comparison of one row."""
     kept: dict[str, Any] = {"left_out": {}, "failed": {}, "unfinished": [], "leaks": "", "cost": [], "commit": None}
-    kept |= {"run_commits": [], "run_devices": ["cpu"], "run_precisions": {}, "notes": [], "encoders": []}
+    kept |= {"run_commits": [], "run_devices": ["cpu"], "run_precisions": {}, "notes": []}
     plan = Plan(name="one", rows=(Row(label="mvitac"),), reference="mvitac", recipe="smoke", probes=("linear", "knn"))
     return {**result, **kept, "plan": to_json(plan), "rows": ["mvitac"]}
 
@@ -154,7 +154,7 @@ def test_tables_of_a_comparison_have_a_table_of_targets(scored: tuple[Path, Pack
     text, tex = table_formats.markdown(whole, lines), table_formats.latex(whole, lines)
     assert "| pattern % | to mvitac | bright % | to mvitac | light R2 % | to mvitac | both R2 % |" in text
     assert "logistic regression or ridge regression on frozen features" in text
-    assert r"light ($R^2$, \%)" in tex and r"pattern (\%)" in tex and tex.count(r"\begin{tabular}") == 3
+    assert r"light R2 \%" in tex and r"pattern \%" in tex and tex.count(r"\begin{tabular}") == 3
     (line,) = (x for x in target_lines(whole)["both"] if (x.source, x.modality) == ("untrained", "touch"))
     weight = line.cells["weight"]
     cell = summarise(whole["records"], "linear")["both"]["touch"]["untrained"]["targets"][1]

@@ -72,9 +72,6 @@ _MANUAL = """Many runs into one table: methods x settings x seeds, next to contr
       label = "colder"
       method = "mvitac"               # the default
       set = {{ "method.temperature" = 0.2, "optim.lr" = 1e-3 }}
-      [[rows]]
-      label = "ImageNet"
-      encoder = "external:timm/resnet18"  # another's encoder: probed, not trained
     """
 
 

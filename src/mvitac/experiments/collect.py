@@ -2,7 +2,6 @@
 
     <out>/plan.json                      the plan
           runs/<row>/seed<k>/            a run as ``mvitac pretrain`` leaves it, with scores.json but no checkpoint
-          encoders.json                  scores of other people's encoders, if the plan has rows with one
           controls.json                  majority, untrained trunk, pixels, border, the data's own, ImageNet if asked
           result.json  table.*           the tables (``table_formats``)
 
@@ -21,7 +20,6 @@ import numpy as np
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask
 from mvitac.evaluation.controls import Records, controls_of, frozen_trunks
-from mvitac.evaluation.encoders import open_encoders, probe_encoders
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
 from mvitac.experiments.jobs import Job, Work
 from mvitac.experiments.plan import ONE_ROW, Plan, Row, slug
@@ -51,9 +49,6 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str
         if row.label in pack.spec.controls:
             raise ValueError(f"row {row.label!r} has the name of a control of this data: give it another label")
         try:
-            if row.encoder:
-                open_encoders([row.encoder], pack)
-                continue
             own, key = _check_row(plan, row, pack)
         except ValueError as error:
             left_out[row.label] = str(error)
@@ -100,7 +95,6 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
         raise ValueError(f"no run of {out} is finished: nothing to show yet{f' ({lost})' if lost else ''}")
     scored = [_scores(job) for job in finished]
     controls, found = _controls(work, out, session)
-    others, described, names = _encoders(work, out, session)
     runs, labels = [load_run(job.out) for job in finished], dict.fromkeys(job.label for job in finished)
     return {
         "plan": to_json(work.plan),
@@ -109,10 +103,9 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
         "group_by": work.pack.spec.group_by,
         "notes": [" ".join(note.split()) for note in work.pack.spec.notes],
         "leaks": leaks(work.pack, chosen(work.pack, session)[0]),
-        "records": [record for records, _ in scored for record in records] + others + controls,
+        "records": [record for records, _ in scored for record in records] + controls,
         "retrieval": [record for _, retrieval in scored for record in retrieval] + found,
-        "rows": [names.get(row.label, row.label) for row in work.plan.rows if row.label not in work.left_out],
-        "encoders": described,
+        "rows": [row.label for row in work.plan.rows if row.label not in work.left_out],
         "left_out": work.left_out,
         "failed": failed,
         "unfinished": [job.name for job in work.jobs if not job.done],
@@ -132,22 +125,6 @@ def _scores(job: Job) -> tuple[Records, Records]:
     method = job.run.method.name
     named = [{**record, "source": job.label + record["source"].removeprefix(method)} for record in records]
     return named, [{**found, "source": job.label} for found in scores["retrieval"]]
-
-
-def _encoders(work: Work, out: Path, session: ProbeConfig) -> tuple[Records, list[dict[str, Any]], dict[str, str]]:
-    """Records and descriptions of the rows with an encoder, and their names in tables; kept in encoders.json."""
-    rows = [row for row in work.plan.rows if row.encoder and row.label not in work.left_out]
-    bound = [open_encoders([row.encoder], work.pack)[0] for row in rows]
-    for row, (model, _) in zip(rows, bound, strict=True):
-        model.name = row.label
-    described, names = [model.describe() for model, _ in bound], {m.name: m.title for m, _ in bound}
-    key, path = digest([to_json(session), work.pack.digest, to_json(work.pack.spec), described]), out / "encoders.json"
-    if path.exists() and (kept := read_json(path, "scores of encoders"))["key"] == key:
-        return kept["records"], described, names
-    records = probe_encoders(bound, *chosen(work.pack, session), session.probes, controls=session.controls)
-    if bound:
-        write_json(path, {"key": key, "records": records}, sealed=True)
-    return records, described, names
 
 
 def _controls(work: Work, out: Path, session: ProbeConfig) -> tuple[Records, Records]:

@@ -34,12 +34,6 @@ class Row:
     """Fields of the run to change, by dotted name, e.g. {"method.temperature": 0.2, "optim.lr": 0.03}."""
     printed: Printed = field(default_factory=dict)
     """The paper's numbers for this row, with positives of the same image. Shown beside such scores of probe paper only."""
-    encoder: str = ""
-    """Another's encoder instead of a run, e.g. "external:timm/NAME" (``bench.external``). It is probed, not trained."""
-
-    def __post_init__(self) -> None:
-        if self.encoder and (self.method, self.recipe, self.set) != ("mvitac", None, {}):
-            raise ValueError(f"row {self.label!r} is an encoder, not trained: leave out method, recipe and set")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,8 +80,6 @@ class Plan:
             raise ValueError(f"plan {self.name!r}: two labels are one, but for case and punctuation: rename one")
         if self.reference not in labels:
             raise unknown("reference row", self.reference, labels)
-        if self.rows[labels.index(self.reference)].encoder:
-            raise ValueError(f"reference {self.reference!r} is another's encoder: choose a row that is trained")
 
     def only(self, labels: Sequence[str]) -> "Plan":
         """The plan with only these rows and the reference; all rows if none is given."""

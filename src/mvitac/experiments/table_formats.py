@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from tabulate import SEPARATING_LINE, tabulate
+from tabulate import tabulate
 
-from mvitac.evaluation.encoders import about_lines
 from mvitac.evaluation.intervals import least_p, num_groups_of
-from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import covered, error_text, percent, pipes, with_interval
 from mvitac.evaluation.scores import by_cell
 from mvitac.experiments.plan import Plan, slug
@@ -23,7 +21,6 @@ from mvitac.report.figures import bars, to_png
 from mvitac.report.tables import RETRIEVAL, probe_name, retrieval_rows
 from mvitac.system.files import write_atomic, write_json
 
-MODALITIES = {"touch": "Tactile", "vision": "Visual", "both": "Tactile + Visual", "none": "-"}  # in LaTeX
 VALUES = ("score", "target", "unit", "mae", "rmse")  # columns of the CSV if there are tasks with values
 
 
@@ -55,9 +52,9 @@ def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
     text = [f"# {plan.title or plan.name}"]
     for paragraph in _preface(result, plan, lines):
         text += ["", paragraph]
-    text += ["", *_table(lines, plan.reference, shown)]
+    text += ["", *pipes(*_table(lines, plan.reference, shown))]
     for task, each in target_lines(result).items():
-        rows = _table(each, plan.reference, False, targets=True)
+        rows = pipes(*_table(each, plan.reference, False, targets=True))
         text += [f"**{task}**: every target, and its mean absolute error", "", *rows]
     text += _auroc(result, plan, lines)
     if rows := retrieval_rows(result["retrieval"]):
@@ -74,8 +71,10 @@ def _first_cells(line: Line) -> list[str]:
     return [f"*{line.source}*" if line.control else line.source, "" if line.modality == "none" else line.modality]
 
 
-def _table(lines: Sequence[Line], reference: str, shown: bool, *, targets: bool = False) -> list[str]:
-    """Lines as a Markdown table, with the paper's numbers if ``shown``, and the error of ``targets``."""
+def _table(
+    lines: Sequence[Line], reference: str, shown: bool, *, targets: bool = False
+) -> tuple[list[str], list[list[str]]]:
+    """Heads and rows of a table of ``lines``, with the paper's numbers if ``shown``, and the error of ``targets``."""
     heads, rows = ["", "modality"], [_first_cells(line) for line in lines]
     for task, score in _columns(lines).items():
         heads += [f"{task} {'R2 ' * (score == 'R2')}%", *["error"] * targets, *["printed"] * shown, f"to {reference}"]
@@ -86,7 +85,7 @@ def _table(lines: Sequence[Line], reference: str, shown: bool, *, targets: bool 
                 row += [*([error_text(cell["targets"][0])] if targets else ()), *[paper] * shown, _gap(cell)]
             else:
                 row += [""] * (2 + targets + shown)
-    return pipes(heads, rows)
+    return heads, rows
 
 
 def _columns(lines: Sequence[Line]) -> dict[str, str]:
@@ -197,52 +196,28 @@ def _cost(result: dict[str, Any]) -> list[str]:
     for c in result["cost"]:
         numbers = [str(c[key]) for key in ("row", "pairs_of", "seeds", "steps", "pairs", "images")]
         rows.append([*numbers, f"{c['trained_parameters'] / 1e6:.2f} M", f"{c['seconds']:.0f}"])
-    return [*pipes(heads, rows), *(f"- {line}" for line in about_lines(result["encoders"]))]
+    return pipes(heads, rows)
 
 
 def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
-    """A booktabs table in the paper's layout: method, modality, score per task, the paper's in parentheses.
-
-    A further table for each task with values has its targets.
-    """
+    """The tables of ``markdown`` in LaTeX (booktabs), after comments about the data, the intervals and leaks."""
     plan = plan_of(result)
-    tables = [_tabular(lines)]
+    notes = [f"{plan.title or plan.name}; data {result['data']}"]
+    notes += [f"printed: in the paper on {plan.printed_on}"] if _any_printed(lines) else []
+    notes += [f"Note: {note}." for note in _notes(result)]
+    notes.append(f"95 % intervals: {covered(result['group_by'], result['records'])}")
+    notes += [f"LEAK: {result['leaks']}."] if result["leaks"] else []
+    tables = [_tabular(*_table(lines, plan.reference, _any_printed(lines)))]
     for task, each in target_lines(result).items():
-        tables.append(f"% {task}: every target, and its mean absolute error\n{_tabular(each, targets=True)}")
-    paper = f"; in parentheses: printed in the paper on {plan.printed_on}" if _any_printed(lines) else ""
-    notes = [f"% {plan.title or plan.name}; data {result['data']}{paper}"]
-    notes += [f"% Note: {note}." for note in _notes(result)]
-    notes.append(f"% 95 % intervals: {covered(result['group_by'], result['records'])}")
-    notes += [f"% LEAK: {result['leaks']}."] if result["leaks"] else []
-    return "\n".join([*(" ".join(note.split()) for note in notes), "\n\n".join(tables)]) + "\n"
+        rows = _tabular(*_table(each, plan.reference, False, targets=True))
+        tables.append(f"% {task}: every target, and its mean absolute error\n{rows}")
+    return "\n".join([*(f"% {' '.join(note.split())}" for note in notes), "\n\n".join(tables)]) + "\n"
 
 
-def _tabular(lines: Sequence[Line], *, targets: bool = False) -> str:
-    """Lines as one LaTeX table, with the error of ``targets``; controls are below a rule."""
-    heads, rows = ["Method", "Modality"], [[line.source, MODALITIES[line.modality]] for line in lines]
-    for task, score in _columns(lines).items():
-        heads += [f"{task} ({'R2, ' * (score == 'R2')}%)", *["error"] * targets]
-        for line, row in zip(lines, rows, strict=True):
-            row.append(_tex_cell(line, task, lines))
-            if targets:
-                row.append(error_text(line.cells[task]["targets"][0]) if task in line.cells else "")
-    num = sum(not line.control for line in lines)
-    shown = [*rows[:num], *([SEPARATING_LINE] if 0 < num < len(rows) else ()), *rows[num:]]
+def _tabular(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     align = ["left", "left", *["right"] * (len(heads) - 2)]
-    text = tabulate(shown, heads, "latex_booktabs", disable_numparse=True, colalign=align)
-    return re.sub(r"\*\*(.*?)\*\*", r"\\textbf{\1}", text).replace("(R2, ", "($R^2$, ")
-
-
-def _tex_cell(line: Line, task: str, lines: Sequence[Line]) -> str:
-    """A score and its interval; the best method of a modality is bold, between asterisks."""
-    cell = line.cells.get(task)
-    if cell is None:
-        return ""
-    best = max(x.cells[task]["mean"] for x in lines if x.modality == line.modality and task in x.cells)
-    number, _, ends = with_interval(cell["mean"], cell["low"], cell["high"]).partition(" ")
-    number = f"**{number}**" if not line.control and cell["mean"] == best else number
-    paper = f" ({percent(cell['printed'])})" if cell["printed"] is not None else ""
-    return f"{number} {ends}{paper}{leak_mark(cell.get('leak', ''))}"
+    text = tabulate(rows, heads, "latex_booktabs", disable_numparse=True, colalign=align)
+    return re.sub(r"(?m)^ *\*(.*?)\*", r" \\textit{\1}", text)  # controls
 
 
 def comma(result: dict[str, Any]) -> str:
