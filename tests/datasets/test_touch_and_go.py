@@ -33,7 +33,6 @@ from mvitac.datasets.touch_and_go.lists import (
     read_lists,
 )
 from mvitac.datasets.touch_and_go.reader import CHUNK, TouchAndGoConfig, _columns, _spec
-from mvitac.datasets.touch_and_go.recordings import Recording
 from mvitac.evaluation.leaks import Scored, source_of
 from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.retrieval import retrieved_rows
@@ -308,9 +307,9 @@ def test_val_is_carved_from_train_by_recording(tree: Path, tmp_path: Path) -> No
 
 
 def test_by_recording_shares_no_recording(tree: Path, tmp_path: Path) -> None:
-    pack = packed(tree, tmp_path / "pack", unlabelled=10, modalities="touch")
+    pack = packed(tree, tmp_path / "pack", modalities="touch")
     group = pack.column("group")
-    sides = [set(group[pack.rows(*names)]) for names in (("train", "unlabelled"), ("val",), ("test",))]
+    sides = [set(group[pack.rows(name)]) for name in ("train", "val", "test")]
     assert all(sides) and sum(map(len, sides)) == len(set().union(*sides)) == 8
     assert not pack.spec.notes and pack.spec.name == "touch-and-go (by-recording)"
     for task in pack.spec.tasks:
@@ -327,49 +326,32 @@ def test_runs_of_frames_are_touches(official: Pack) -> None:
         assert touch.endswith(f"/{members[0]:010d}")
 
 
-def test_frames_without_a_label_serve_pre_training(tree: Path, tmp_path: Path) -> None:
+def test_a_frame_without_a_label_is_left_out(tree: Path, tmp_path: Path) -> None:
     root = shutil.copytree(tree, tmp_path / "tree")
     lines = (root / "train.txt").read_text().splitlines()
     lines[0] = lines[0].split(",")[0] + ",-1"  # inconclusive
     (root / "train.txt").write_text("\n".join(lines))
-    (root / "dataset" / "20220601_120000").mkdir()
-    shutil.copy(root / "dataset" / NAMES[0] / "gelsight.mp4", root / "dataset" / "20220601_120000" / "gelsight.mp4")
-    with_none = packed(root, tmp_path / "none", modalities="touch")
-    assert with_none.num == 7 * 33 + 8 - 1 and not len(with_none.rows("unlabelled"))
-    pack = packed(root, tmp_path / "some", modalities="touch", unlabelled=7)
-    rows = pack.rows("unlabelled")
-    assert set(pack.column("group")[rows]) - {"20220601_120000"} == set(pack.column("group")[pack.rows("train")])
-    assert (pack.column("label_category")[rows] == -1).all() and (pack.column("frame")[rows] % 7 == 0).all()
-    assert (pack.column("group")[rows] == "20220601_120000").sum() == len(range(0, NUM_FRAMES, 7))
-    check_pairs(pack)
-    between = [t for t, f in zip(pack.column("touch_group")[rows], pack.column("frame")[rows], strict=True) if f == 35]
-    assert all(touch.endswith(("/0000000030", "/0000000000")) for touch in between)
+    assert packed(root, tmp_path / "none", modalities="touch").num == 7 * 33 + 8 - 1
 
 
 def test_the_cache_knows_changed_jpegs(tmp_path: Path) -> None:
-    """Another frame in place of a listed one, of whatever size; more frames, of which some are taken without a label."""
+    """Another frame in place of a listed one, of whatever size."""
     for name, side in zip(NAMES[:2], ("train", "test"), strict=True):
         (tmp_path / f"{side}.txt").write_text("\n".join(f"{name}/{i:010d}.jpg,{i % 2}" for i in range(6)))
-    config = TouchAndGoConfig(root=tmp_path, size=16, workers=1, split="official", unlabelled=2)
+    config = TouchAndGoConfig(root=tmp_path, size=16, workers=1, split="official")
     packs = []
-    for level, num, when in ((40, 8, 10), (200, 8, 20), (200, 12, 20)):
+    for level, when in ((40, 10), (200, 20)):
         for name in NAMES[:2]:
             for stem in ("video", "gelsight"):
                 folder = tmp_path / "dataset" / name / f"{stem}_frame"
                 folder.mkdir(parents=True, exist_ok=True)
-                for number in range(num):
+                for number in range(6):
                     file = folder / f"{number:010d}.jpg"
                     Image.new("RGB", (16, 16), (level, level, level)).save(file)
                     os.utime(file, (when, when))
         packs.append(config.open(quiet=True))
-    assert [(pack.num, int(pack.images["touch"][0, 0, 0, 0])) for pack in packs] == [(13, 40), (13, 200), (15, 200)]
-    assert packs[0].meta["fingerprint"] == packs[2].meta["fingerprint"]
-
-
-def test_frames_without_a_label_that_are_nowhere(tree: Path) -> None:
-    """The official split tests nearly every recording: an option that would do nothing is refused, not ignored."""
-    with pytest.raises(ValueError, match="unlabelled 7 adds no frame: recordings with test or val frames give none"):
-        TouchAndGoConfig(root=tree, split="official", unlabelled=7).source()
+    assert [(pack.num, int(pack.images["touch"][0, 0, 0, 0])) for pack in packs] == [(12, 40), (12, 200)]
+    assert packs[0].meta["fingerprint"] == packs[1].meta["fingerprint"]
 
 
 @pytest.mark.parametrize("jpegs", [False, True])
@@ -400,38 +382,6 @@ def test_missing_recordings_are_named_and_may_be_left_out(tree: Path, tmp_path: 
     assert sorted(pack.meta["fingerprint"]["missing"]) == [NAMES[1], NAMES[4], NAMES[5]]
     touch = packed(root, tmp_path / "touch", partial=True, modalities="touch")
     assert set(touch.column("group")) == set(NAMES) - {NAMES[1]} and touch.spec.modalities == ("touch",)
-
-
-def test_the_doctor_is_told_what_the_lists_name_and_the_download_lacks(tree: Path, tmp_path: Path) -> None:
-    root = shutil.copytree(tree, tmp_path / "tree")
-    whole = {count.what: count for count in TouchAndGoConfig(root=root).source().expected()}
-    assert (whole["rows of train.txt"].published, whole["rows of train.txt"].found) == (91_982, 7 * 25)
-    assert (whole["rows of test_rough.txt"].published, whole["rows of test_rough.txt"].found) == (8_085, 2 * 8)
-    for what, num in (("listed recordings", 8), ("listed frames in their recordings", 239)):
-        assert (whole[what].published, whole[what].found, whole[what].detail) == (num, num, "")
-
-    shutil.rmtree(root / "dataset" / NAMES[1])
-    write_video(root / "dataset" / NAMES[2] / "gelsight.mp4", 135, lambda i: numbered(i, "touch"))
-    (root / "dataset" / NAMES[3] / "video.mp4").write_bytes(b"no film")
-    part = {count.what: count for count in TouchAndGoConfig(root=root, partial=True).source().expected()}
-    assert part["listed recordings"].found == 7 and NAMES[1] in part["listed recordings"].detail
-    inside = part["listed frames in their recordings"]
-    own = {name: sum(name in row for row in _listed(root)) for name in NAMES}
-    assert inside.found == 239 - own[NAMES[1]] - own[NAMES[3]] - 10
-    assert f"{NAMES[2]} has 135 frames, listed up to 144" in inside.detail
-    assert f"{NAMES[3]} has 0 frames" in inside.detail and "video.mp4" in inside.detail
-
-
-def test_a_folder_of_jpegs_has_the_frames_up_to_its_last(tmp_path: Path) -> None:
-    recording = Recording("r", {"touch": tmp_path})
-    assert recording.num_frames() == 0
-    for name in ("0000000006.jpg", "0000000002.jpg", "thumbs.db"):
-        (tmp_path / name).touch()
-    assert recording.num_frames() == 7
-
-
-def _listed(root: Path) -> set[str]:
-    return {row.split(",")[0] for file in root.glob("*.txt") for row in file.read_text().split()}
 
 
 def test_a_damaged_stretch_is_left_out_and_listed(tree: Path, tmp_path: Path) -> None:
@@ -489,7 +439,6 @@ def test_bad_lists_are_told(tree: Path, tmp_path: Path, name: str, text: str | N
 @pytest.mark.parametrize(
     "options",
     [
-        {"unlabelled": -1},
         {"test_share": 0.0},
         {"val_share": 1.0},
         {"test_share": 0.6, "val_share": 0.5},

@@ -32,16 +32,6 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Count:
-    """A published count and what was found."""
-
-    what: str
-    published: int
-    found: int
-    detail: str = ""  # what is missing or extra, if known
-
-
-@dataclass(frozen=True)
 class Lost:
     """A damaged sample of an otherwise good item, such as one frame of a recording."""
 
@@ -98,7 +88,3 @@ class Source(ABC):
     def samples_per_item(self) -> Sequence[int]:
         """Return the largest number of samples of each item; it is exact if none is damaged or lost."""
         return [1] * len(self.items())
-
-    def expected(self) -> list[Count]:
-        """Return published counts and what was found, for `mvitac data check`."""
-        return []

@@ -1,4 +1,4 @@
-"""The doctor: a healthy dataset is called healthy, and each of sixteen faults is called by its name and nothing else."""
+"""The doctor: a healthy dataset is called healthy, and each of fourteen faults is called by its name and nothing else."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from PIL import Image
 
@@ -22,7 +21,7 @@ from mvitac.data.checks.image_checks import MAX_LAG, motion_correlations
 from mvitac.data.checks.image_stats import look_at
 from mvitac.data.checks.name_checks import similar_names
 from mvitac.data.pack import Pack
-from mvitac.data.source import Count, Sample, Source
+from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Task
 from mvitac.datasets.folder import FolderConfig
 from mvitac.report.contact_sheet import Block, pair, suspicious
@@ -58,10 +57,6 @@ class Presses(Source):
     def fingerprint(self) -> dict[str, Any]:
         return {"presses": self.fault}
 
-    def expected(self) -> list[Count]:
-        num = NUM_OBJECTS + (self.fault == "published")
-        return [Count("objects", num, NUM_OBJECTS, "missing 20" if num > NUM_OBJECTS else "")]
-
     def read(self, item: int) -> list[Sample]:
         obj, k = divmod(item, NUM_FRAMES)
         fault, held_out = self.fault, obj in TEST
@@ -83,8 +78,6 @@ class Presses(Source):
             touch = np.full_like(touch, 7)
         if (fault == "bgr" and obj in (2, 5, 8)) or (fault == "half bgr" and obj % 2):
             touch = touch[:, :, ::-1].copy()
-        if fault == "gray" and obj == 6:
-            vision = np.repeat(vision.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
         if fault == "swapped" and obj == 7:
             vision, touch = touch, vision
         if fault == "sizes" and obj % 4 == 1:
@@ -106,10 +99,6 @@ class Presses(Source):
             columns["label_material"] = -1
         if fault == "unseen class":
             columns["label_material"] = 2 if held_out else obj % 2
-        if fault == "numbers" and item == 41:
-            columns["force"] = float("nan")
-        if fault == "range" and item == 41:
-            columns["force"] = 1e6
         if fault == "sensor":
             columns["sensor"] = f"lab {material}"
         if fault == "names of groups":  # 2022_000101 is a recording, though Python reads a number in it
@@ -159,9 +148,8 @@ def noisy(image: np.ndarray, seed: list[int]) -> np.ndarray:
 
 
 def check(fault: str, tmp_path: Path) -> dict[str, Finding]:
-    source = Presses(fault)
-    pack = build(source, tmp_path / "pack", size=SIDE, max_damaged=1.0, quiet=True)
-    return {finding.item: finding for finding in examine(pack, source.expected())}
+    pack = build(Presses(fault), tmp_path / "pack", size=SIDE, max_damaged=1.0, quiet=True)
+    return {finding.item: finding for finding in examine(pack)}
 
 
 @pytest.mark.parametrize("kind", ["", "names of groups", "written label"])
@@ -177,7 +165,6 @@ FAULTS = {
     "constant": ("constant frames", "look", "touch: 7 of 320 (2.2 %), first 00-03"),
     "bgr": ("red and blue swapped", "look", "whole groups: object 2, object 5, object 8"),
     "half bgr": ("red and blue swapped", "look", "160 of 320 (50.0 %)"),
-    "gray": ("grayscale among colour", "look", "vision: 16 of 320"),
     "swapped": ("vision and touch swapped", "look", "whole groups: object 7"),
     "offset": ("time offset between streams", "look", "touch comes 2 rows late"),
     "unseen class": ("classes of material", "broken", "tested but never seen in training: cloth"),
@@ -190,11 +177,8 @@ FAULTS = {
         r"group: 'OBJECT\xa003' and 'object 3'; 1 of these are in more than one split",
     ),
     "labels": ("missing labels", "look", "first 00-01"),
-    "numbers": ("numbers", "look", "force is not a number in 1 of 320 (0.3 %), first row 41"),
-    "range": ("numbers", "look", "force is 1e+06 in row 41"),
     "sensor": ("sensors and resolutions", "look", "sensor alone predicts material with 100 % accuracy"),
     "give-away": ("columns that give a label away", "look", "force predicts material with 91 % accuracy"),
-    "published": ("published: objects", "look", "20 found, 21 published; missing 20"),
 }
 
 
@@ -225,16 +209,6 @@ def test_classes_that_differ_in_spelling_only(pack: Pack) -> None:
         found = similar_names(other)
         assert found.verdict == ("look" if alike else "ok"), classes
         assert (f"classes of pattern: {alike}" == found.evidence) == bool(alike), found.evidence
-
-
-def test_groups_of_two_parts_that_differ_in_spelling_only(pack: Pack) -> None:
-    """The parts of a mix are one training set; equal names are one group there, and numbers mean nothing outside a part."""
-    other, half = copy.copy(pack), pack.num // 2
-    other.parts = {"a": pack, "b": pack}
-    for first, second, differ in (("Mug", "mug ", True), ("mug", "mug", False), ("1", "01", False)):
-        groups = pa.array([f"a/{first}"] * half + [f"b/{second}"] * (pack.num - half))
-        other.table = pack.table.set_column(pack.table.schema.get_field_index("group"), "group", groups)
-        assert ("group: 'a/Mug' and 'b/mug '" in similar_names(other).evidence) == differ, (first, second)
 
 
 # -- the source and the pack --------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from mvitac.data.checks import duplicates, image_checks, name_checks, table_chec
 from mvitac.data.checks.finding import Finding, judged
 from mvitac.data.checks.image_stats import look_at
 from mvitac.data.pack import Pack
-from mvitac.data.source import Count, Lost, Sample, Source
+from mvitac.data.source import Lost, Sample, Source
 from mvitac.data.spec import DataSpec, Window
 
 SINGLE = Window()
@@ -47,9 +47,6 @@ class ThumbnailSource(Source):
         counts = self.source.samples_per_item()
         return [counts[number] for number in self._chosen]
 
-    def expected(self) -> list[Count]:
-        return self.source.expected()
-
     def read(self, item: int) -> list[Sample | Lost]:
         samples: list[Sample | Lost] = []
         for sample in self.source.read(self._chosen[item]):
@@ -63,10 +60,8 @@ class ThumbnailSource(Source):
         return samples
 
 
-def examine(
-    pack: Pack, counts: list[Count] | None = None, *, part: bool = False, window: Window = SINGLE
-) -> list[Finding]:
-    """Run every check on ``pack``; ``counts`` are published ones.
+def examine(pack: Pack, *, part: bool = False, window: Window = SINGLE) -> list[Finding]:
+    """Run every check on ``pack``.
 
     Of a ``part`` of a source, missing classes may be in the rest, so they are not "broken". A ``window`` of several
     frames is checked, too.
@@ -78,11 +73,9 @@ def examine(
         milder = [replace(f, verdict="look", evidence=note + f.evidence) for f in labels]
         labels = [mild if f.verdict == "broken" else f for f, mild in zip(labels, milder, strict=True)]
     return [
-        *table_checks.published(counts or []),
         table_checks.unreadable(pack),
         table_checks.missing_images(pack),
         image_checks.constant_frames(pack, looks),
-        image_checks.grayscale_mix(pack, looks),
         image_checks.red_and_blue(pack, looks),
         image_checks.swapped_modalities(pack, looks),
         image_checks.time_offset(pack, looks),
@@ -94,7 +87,6 @@ def examine(
         name_checks.similar_names(pack),
         duplicates.exact_copies(pack, looks),
         duplicates.near_copies(pack, looks),
-        table_checks.numbers(pack),
         table_checks.give_aways(pack),
         *([value_checks.windows(pack, window, part=part)] if window.active else []),
     ]
@@ -137,7 +129,7 @@ def examine_source(
     with tempfile.TemporaryDirectory(prefix="mvitac-check-") as folder:
         pack = build(thumbnails, Path(folder) / "pack", size=size, workers=workers, max_damaged=1.0, quiet=quiet)
         partly = len(thumbnails.items()) < len(source.items())
-        findings = examine(pack, thumbnails.expected(), part=partly, window=window)
+        findings = examine(pack, part=partly, window=window)
         read = f"{len(thumbnails.items())} of {len(source.items())} items examined, kept at {size} px"
         findings.insert(0, Finding("source", "ok", f"{pack.spec.name}: {read}"))
         draw(pack, findings)

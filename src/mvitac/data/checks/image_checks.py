@@ -26,23 +26,6 @@ def constant_frames(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     return judged("constant frames", evidence, advice, rows, look=bool(rows), broken=broken)
 
 
-def grayscale_mix(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
-    """Find images without colour in a dataset with colour."""
-    rows: list[int] = []
-    notes = []
-    for name, one in looks.items():
-        gray, seen = one.gray & one.seen, one.seen  # the colour of a constant image is meaningless
-        if gray.sum() and (gray.sum() < seen.sum()):
-            minority = gray if gray.sum() * 2 <= seen.sum() else seen & ~gray
-            rows += np.flatnonzero(minority).tolist()
-            notes.append(f"{name}: {share(int(gray.sum()), int(seen.sum()))} have no colour")
-        elif gray.any():
-            notes.append(f"{name}: all without colour")
-    evidence = "; ".join(notes) or "all in colour"
-    advice = "different cameras or converters: convert all alike, or mark them as different sensors"
-    return judged("grayscale among colour", evidence, advice, rows, look=bool(rows))
-
-
 def red_and_blue(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     """Find a minority of images stored as BGR: their red minus blue mirrors that of the others.
 

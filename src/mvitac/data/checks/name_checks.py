@@ -3,6 +3,7 @@
 import re
 import unicodedata
 from collections import defaultdict
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,7 +12,6 @@ from mvitac.data.checks.table_checks import KEYS, sides_of
 from mvitac.data.pack import Pack
 
 MAX_SHOWN = 20
-PREFIXED = ("group", "touch_group")  # columns in which a mix writes <part>/ before each name
 
 
 def similar_names(pack: Pack) -> Finding:
@@ -23,7 +23,7 @@ def similar_names(pack: Pack) -> Finding:
         if column not in pack.table.column_names:
             continue
         values = pack.column(column).astype(str)
-        alike = _alike(np.unique(values).tolist(), across_parts=bool(pack.parts) and column in PREFIXED)
+        alike = _alike(np.unique(values).tolist())
         on = [{side for name in names for side in sides[values == name].tolist()} for names in alike]
         apart = sum(len(found) > 1 for found in on)
         if alike:
@@ -38,18 +38,12 @@ def similar_names(pack: Pack) -> Finding:
     return judged("names that differ in spelling only", evidence, advice, list(dict.fromkeys(rows)), look=bool(notes))
 
 
-def _alike(names: list[str] | tuple[str, ...], *, across_parts: bool = False) -> list[list[str]]:
-    """Return the sets of names with the same ``_key``.
-
-    With ``across_parts`` names of a mix are compared without their prefix ``<part>/``. Equal ones are one group, and
-    numbers mean nothing outside their part.
-    """
-    found: dict[str, dict[str, str]] = defaultdict(dict)
+def _alike(names: Sequence[str]) -> list[list[str]]:
+    """Return the sets of names with the same ``_key``."""
+    found: dict[str, list[str]] = defaultdict(list)
     for name in names:
-        own = name.partition("/")[2] if across_parts else name
-        own = name if own.isdigit() else own
-        found[_key(own)].setdefault(own, name)
-    return [[*several.values()] for several in found.values() if len(several) > 1]
+        found[_key(name)].append(name)
+    return [several for several in found.values() if len(several) > 1]
 
 
 def _key(name: str) -> str:

@@ -1,6 +1,5 @@
-"""Checks of the table: damaged items, labels, classes, leaks between splits, sensors, numbers, published counts."""
+"""Checks of the table: damaged items, labels, classes, leaks between splits, sensors, columns that tell a label."""
 
-import contextlib
 from collections.abc import Iterator
 
 import numpy as np
@@ -8,11 +7,11 @@ import numpy as np
 from mvitac.data.checks.finding import Finding, judged, share, some
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
-from mvitac.data.source import Count
 from mvitac.data.spec import UNGROUPED
 
 KEYS = ("object", "instance", "recording", "video", "grasp", "experiment", "session", "sequence")
 """Columns whose values should not be in more than one split either, if the dataset has them."""
+PACKED = ("label_", "has_", "crc_", "bytes_")  # what the columns that packing adds begin with
 MIX = ("sensor", "vision_size", "touch_size")  # columns that describe how an image was taken
 
 
@@ -175,26 +174,6 @@ def _predicts(what: str, task: str, values: np.ndarray, labels: np.ndarray) -> l
     return [f"{what} predicts {task} with {100 * told:.0f} % accuracy (majority {100 * majority:.0f} %)"]
 
 
-def numbers(pack: Pack) -> Finding:
-    """Find numeric columns with gaps, infinities or extreme outliers."""
-    notes, rows, seen = [], [], 0
-    targets = {target.name for task in pack.spec.values for target in task.targets}  # these have a check of their own
-    for name, values in ((name, values) for name, values in numeric_columns(pack) if name not in targets):
-        seen += 1
-        good = np.isfinite(values)
-        if good.any() and not good.all():
-            bad = np.flatnonzero(~good)
-            notes.append(f"{name} is not a number in {share(len(bad), len(values))}, first row {bad[0]}")
-            rows += bad.tolist()
-        if good.sum() >= 8:
-            low, middle, high = np.percentile(values[good], [5, 50, 95])
-            far = np.flatnonzero(good & (np.abs(values - middle) > 100 * (high - low)) & (high > low))
-            notes += [f"{name} is {values[row]:g} in row {row}, others {low:g} to {high:g}" for row in far[:1]]
-            rows += far.tolist()
-    evidence = "; ".join(notes) or f"{seen} columns, all finite and in range"
-    return judged("numbers", evidence, "repair the cells, or leave the rows out", rows, look=bool(notes))
-
-
 def give_aways(pack: Pack) -> Finding:
     """Find numeric columns that predict a label: confounds that a control probe should use.
 
@@ -202,13 +181,16 @@ def give_aways(pack: Pack) -> Finding:
     with that of the majority class. A column that is the label itself (each value one class) or a control is skipped.
     """
     notes = []
-    known = {column for columns in pack.spec.controls.values() for column in columns}
+    other = {"id", *(task.name for task in pack.spec.tasks), *(c for used in pack.spec.controls.values() for c in used)}
+    names = [pack.column(key).astype(str) for key in ("group", "touch_group") if key in pack.table.column_names]
+    columns = [name for name in pack.table.column_names if not (name in other or name.startswith(PACKED))]
+    columns = [name for name in columns if not any((pack.column(name).astype(str) == one).all() for one in names)]
     for task in pack.spec.tasks:
         labels = pack.labels(task.name, "train", "val")
         rows, labels = np.flatnonzero(labels >= 0), labels[labels >= 0]
-        for name, values in numeric_columns(pack) if len(rows) >= 64 else ():
-            mine = values[rows]
-            if name in known or not np.isfinite(mine).all() or len(np.unique(mine)) < 2 or _is_label(mine, labels):
+        for name in columns if len(rows) >= 64 else ():
+            mine = _numbers(pack.column(name)[rows])
+            if mine is None or not np.isfinite(mine).all() or len(np.unique(mine)) < 2 or _is_label(mine, labels):
                 continue
             part = np.searchsorted(np.unique(np.quantile(mine, np.arange(1, 8) / 8)), mine)
             notes += _predicts(name, task.name, part, labels)
@@ -224,37 +206,9 @@ def _is_label(values: np.ndarray, labels: np.ndarray) -> bool:
     return len(names) <= 2 * len(np.unique(labels)) and all(one_class)
 
 
-def numeric_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield (name, float [N]) of columns of numbers (or text of numbers), except ids, groups, labels and checksums."""
-    other = {"id", *(task.name for task in pack.spec.tasks)}
-    names = [pack.column(key).astype(str) for key in ("group", "touch_group") if key in pack.table.column_names]
-    for name in pack.table.column_names:
-        values = pack.column(name)
-        if name in other or name.startswith(("label_", "crc_", "bytes_")):
-            continue
-        if any((values.astype(str) == one).all() for one in names):
-            continue
-        values = _parsed(values) if values.dtype.kind == "O" else values
-        if values is not None and values.dtype.kind in "fiub":
-            yield name, values.astype(float)
-
-
-def _parsed(values: np.ndarray) -> np.ndarray | None:
-    """Convert a text column to float, gaps to NaN; None unless at least 90 % of the cells are numbers."""
-    out = np.full(len(values), np.nan)
-    known = 0
-    for i, cell in enumerate(values):
-        with contextlib.suppress(TypeError, ValueError):
-            out[i] = float("" if "_" in str(cell) else cell)  # 20220319_002026 is a name
-            known += 1
-    return out if known >= 0.9 * len(values) else None
-
-
-def published(counts: list[Count]) -> list[Finding]:
-    """Compare counts of the source with the published ones."""
-    findings = []
-    for count in counts:
-        evidence = f"{count.found} found, {count.published} published" + (f"; {count.detail}" if count.detail else "")
-        advice = "fine for a part of the data; mention it with every result"
-        findings.append(judged(f"published: {count.what}", evidence, advice, look=count.published != count.found))
-    return findings
+def _numbers(cells: np.ndarray) -> np.ndarray | None:
+    """Return cells as floats; None if one is no number. 20220319_002026 is a name, although Python reads it as one."""
+    try:
+        return np.array([float("" if "_" in str(cell) else cell) for cell in cells])
+    except (TypeError, ValueError):
+        return None

@@ -4,11 +4,7 @@ Sources: github.com/robertocalandra/the-feeling-of-success (repairs, shuffle); g
 """
 
 import random
-from collections import Counter
 from collections.abc import Sequence
-from typing import Any
-
-import numpy as np
 
 _TEST = """international_travel_adapter 3d_printed_blue_connector soft_zebra fake_flower_in_pot metal_can french_dip
 metal_cylinder_with_holes soft_beer_bottle_holder"""
@@ -34,21 +30,12 @@ REPAIRS = {
 """Wrong name in some recordings (cut to 11 letters, or another word) -> object, from the owners' scripts."""
 
 
-def object_name(value: Any) -> str:
-    """Return the repaired name in an object_name attribute (bytes, text, or an array of one)."""
-    value = np.asarray(value).reshape(-1)
-    if len(value) != 1 or not isinstance(value[0], (bytes, str)):
-        raise ValueError(f"object_name is {value.tolist()}, not one name")
-    text = value[0].decode("utf-8") if isinstance(value[0], bytes) else str(value[0])
-    name = text.strip(" \0\n\r\t")
-    if not name:
+def repaired(name: bytes | str) -> str:
+    """Return the name in an attribute object_name, repaired."""
+    text = (name.decode() if isinstance(name, bytes) else name).strip(" \0\n\r\t")
+    if not text:
         raise ValueError("object_name is empty")
-    return REPAIRS.get(name, name)
-
-
-def most_attempted(counts: Counter[str]) -> list[str]:
-    """Return the 40 objects with most attempts; ties are sorted by name."""
-    return sorted(counts, key=lambda name: (-counts[name], name))[:40]
+    return REPAIRS.get(text, text)
 
 
 def owners_shuffle(names: Sequence[str], seed: int) -> list[str]:

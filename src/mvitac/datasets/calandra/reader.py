@@ -11,22 +11,20 @@ with open fingers, 'during' with closed fingers before the lift, and 'after' 4 s
 visible. Only rows of the phases in ``ask`` are labelled, so 'after' cannot be probed by mistake, and a task that uses it has
 a name that says so.
 
-Sources: the owners' scripts (github.com/robertocalandra/the-feeling-of-success) for name repairs, the Kinect crop and the
-split by object; the authors' notebook (github.com/ligerfotis/mvitac, create_dataset.ipynb) for their 32 and 8 objects.
+Sources: the owners' scripts (github.com/robertocalandra/the-feeling-of-success) for name repairs and the split
+by object; the authors' notebook (github.com/ligerfotis/mvitac, create_dataset.ipynb) for their 32 and 8 objects.
 """
 
 import math
 import re
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from tyro.conf import Fixed
 
-from mvitac.data.source import Count, Sample, Source, one_stamp, stamp_of
+from mvitac.data.source import Sample, Source, one_stamp, stamp_of
 from mvitac.data.spec import PHASES, DataSpec, Task
 from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.datasets.calandra import objects
@@ -36,11 +34,8 @@ from mvitac.system.files import brief, digest
 
 VERSION = 1  # version of this reader. Increase it when the same shards would give another pack.
 Phase = Literal["before", "during", "after"]
-NUM_SHARDS, NUM_PER_SHARD, NUM_GRASPS = 38, 250, 9296
+NUM_SHARDS = 38
 SHARD = re.compile(r"calandra_corl2017_\d{3}\.h5")
-
-KINECT_CROP = (0.06441159, 0.60563023, 0.13482023, 0.97554603)
-"""Top, bottom, left, right as fractions of the image: the owners' crop to the table and some space above it."""
 
 _CLASSES = ("failure", "success")
 TASKS = {
@@ -75,16 +70,9 @@ class CalandraConfig(DatasetConfig):
     outcome. authors: success_trained_with_after, their protocol (train on all phases, choose and test on 'during')."""
     phases: tuple[Phase, ...] = PHASES
     """Phases that become rows. All of them are used for pre-training."""
-    kinect_crop: Fixed[bool] = False
-    """Crop the camera image to the table, as the owners do."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, values in (("shards", self.shards), ("ask", self.ask), ("phases", self.phases)):
-            if len(set(values)) < len(values):
-                raise ValueError(f"{name} {' '.join(map(str, values))}: name each once")
-        if not self.phases:
-            raise ValueError(f"phases: give at least one of {', '.join(PHASES)}")
         if not self.split.startswith("fold:") and self.split not in ("authors", "object"):
             raise unknown("split", self.split, ("authors", "object", "fold:K", "fold:NAME"))
         check_range(self, 0, 0.9, "val_share")
@@ -118,12 +106,7 @@ class Calandra(Source):
         self.config = config
         self._files = {file: stamp_of(str(file)) for file in find_shards(config.path, config.shards)}
         everything = [grasp for file in self._files for grasp in list_grasps(file)]
-        self.counts = Counter(grasp.object for grasp in everything if not grasp.damage)
-        """Attempts per object in all shards, including objects that the split leaves out."""
-        if not self.counts:
-            first = everything[0].damage if everything else "it holds no grasps"
-            raise ValueError(f"{config.path}: no grasp can be read ({first}): download the shards again")
-        self._splits = split_objects(config, sorted(self.counts))
+        self._splits = split_objects(config, sorted({grasp.object for grasp in everything if not grasp.damage}))
         # Objects that the split leaves out are not read; damaged grasps are kept, to be listed.
         self._grasps = [grasp for grasp in everything if grasp.damage or grasp.object in self._splits]
 
@@ -168,13 +151,8 @@ class Calandra(Source):
         where = f"{grasp.shard:03d}-{grasp.index:03d}"
         with h5py.File(grasp.file) as file:
             for phase in (phase for phase in PHASES if phase in self.config.phases):
-                names = (f"{name}_{phase}" for name in ("gelsightA", "gelsightB", "kinectA_rgb"))
-                left, right, vision = (_image(file, name, grasp) for name in names)
-                if left.shape != right.shape:
-                    raise ValueError(
-                        f"{grasp.file.name} i{grasp.index}: gelsightA_{phase} is {left.shape}, gelsightB_{phase} is"
-                        f" {right.shape}: stacked sensors need one size"
-                    )
+                names = (f"data/i{grasp.index}/{name}_{phase}" for name in ("gelsightA", "gelsightB", "kinectA_rgb"))
+                left, right, vision = (_image(file, name) for name in names)
                 columns = {
                     "id": f"{where}-{phase}",
                     "group": grasp.object,
@@ -188,24 +166,10 @@ class Calandra(Source):
                     "outcome": int(grasp.gripping),
                     "shard": grasp.shard,
                 }
-                vision = crop_kinect(vision) if self.config.kinect_crop else vision
                 # One element of three bytes per pixel: five times as fast as by channel.
                 both = np.concatenate([left.view("V3"), right.view("V3")], axis=2).view(np.uint8)
                 samples.append(Sample(vision=vision, touch=both, columns=columns))
         return samples
-
-    def expected(self) -> list[Count]:
-        """Count shards and grasps, and compare the 40 most attempted objects with the authors' list."""
-        have = {_number(file) for file in self._files}
-        absent = sorted(set(range(NUM_SHARDS)) - have)
-        top, listed = objects.most_attempted(self.counts), {*AUTHORS_TRAIN, *AUTHORS_TEST}
-        lacking, others = sorted(listed - set(top)), sorted(set(top) - listed)
-        swaps = f"listed but not among them: {', '.join(lacking)}; among them: {', '.join(others)}" if lacking else ""
-        return [
-            Count("shards", NUM_SHARDS, len(have), f"missing {' '.join(f'{n:03d}' for n in absent)}" if absent else ""),
-            Count("grasps that can be read", NUM_GRASPS, sum(self.counts.values())),
-            Count("objects of the authors' list among the 40 most attempted", 40, len(listed & set(top)), swaps),
-        ]
 
 
 def _number(file: Path) -> int:
@@ -224,52 +188,38 @@ def find_shards(path: Path, shards: Sequence[int]) -> list[Path]:
         raise ValueError(
             f"{path} has no {lacking}: download it (doi 10.25532/OPARA-700) or give another path or shards"
         )
-    return [files[number] for number in sorted(shards or files)]
+    return [files[number] for number in sorted(set(shards) or files)]
 
 
 def list_grasps(file: Path) -> list[Grasp]:
-    """Return every grasp of a shard with name and outcome. In a shard that cannot be opened, all grasps are damaged."""
+    """Return every grasp of a shard with name and outcome."""
     import h5py
 
-    shard = _number(file)
     try:
         with h5py.File(file) as opened:
             data: Any = opened["data"]
             indices = sorted(int(name[1:]) for name in data if re.fullmatch(r"i\d+", name))
-            return [_describe(data, Grasp(file, shard, index)) for index in indices]
+            return [_describe(data, Grasp(file, _number(file), index)) for index in indices]
     except (OSError, KeyError, RuntimeError, TypeError) as error:  # h5py raises these for damaged files
-        damage = f"{file.name} cannot be read as HDF5 ({brief(error)}): download it again or leave it out of shards"
-        num = NUM_GRASPS - NUM_PER_SHARD * shard if shard == NUM_SHARDS - 1 else NUM_PER_SHARD
-        return [Grasp(file, shard, index, damage=damage) for index in range(num)]
+        raise ValueError(
+            f"{file} cannot be read ({brief(error)}): download it again, or leave it out of shards"
+        ) from None
 
 
 def _describe(data: Any, grasp: Grasp) -> Grasp:
     try:
         attributes = data[f"i{grasp.index}"].attrs
-        name = objects.object_name(attributes["object_name"])
-        gripping = np.asarray(attributes["is_gripping"]).reshape(-1)
-        if len(gripping) != 1 or gripping[0] not in (0, 1):
-            raise ValueError(f"is_gripping is {gripping.tolist()}, not one true or false")
+        name, gripping = (np.asarray(attributes[key]).item() for key in ("object_name", "is_gripping"))
+        return replace(grasp, object=objects.repaired(name), gripping=bool(gripping))
     except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
-        why = f"{grasp.file.name} i{grasp.index}: attributes cannot be read ({brief(error)})"
-        return Grasp(grasp.file, grasp.shard, grasp.index, damage=why)
-    return Grasp(grasp.file, grasp.shard, grasp.index, name, bool(gripping[0]))
+        return replace(grasp, damage=f"attributes cannot be read ({brief(error)})")
 
 
-def _image(file: Any, name: str, grasp: Grasp) -> np.ndarray:
+def _image(file: Any, name: str) -> np.ndarray:
     try:
-        dataset = file[f"data/i{grasp.index}/{name}"]
-        if dataset.dtype != np.uint8 or len(dataset.shape) != 3 or dataset.shape[2] != 3 or 0 in dataset.shape:
-            raise ValueError(f"is {dataset.dtype} {dataset.shape}, not uint8 H x W x 3")
-        return dataset[()]
-    except (OSError, KeyError, RuntimeError, AttributeError, ValueError) as error:
-        raise ValueError(f"{grasp.file.name} i{grasp.index}: {name} cannot be read ({brief(error)})") from None
-
-
-def crop_kinect(image: np.ndarray) -> np.ndarray:
-    """Crop uint8 [H, W, 3] to the table (``KINECT_CROP``)."""
-    (height, width), (top, bottom, left, right) = image.shape[:2], KINECT_CROP
-    return image[int(top * height) : int(bottom * height), int(left * width) : int(right * width)]
+        return file[name][()]
+    except (OSError, KeyError, RuntimeError) as error:
+        raise ValueError(f"{name} cannot be read ({brief(error)})") from None
 
 
 def may_ask(asked: Ask, phase: str, split: str) -> bool:

@@ -22,8 +22,6 @@ CLASSES = (
 SOFT = (7, 8, 9, 11, 13)  # categories that the owners call soft; the others are hard
 AT = "https://github.com/fredfyyang/Touch-and-Go, folder 'Visuo-tactile contrastive learning/dataset'"
 LIST_FILES = ("train.txt", "test.txt", "train_rough.txt", "test_rough.txt", "label.txt")
-NUM_ROWS = {"train.txt": 91_982, "test.txt": 29_879, "train_rough.txt": 35_119, "test_rough.txt": 8_085}
-"""Number of rows of the published lists."""
 ROW = re.compile(r"^[ \t]*([^/,\s]+)/(\d{10})\.jpg,(-?\d{1,9})[ \t]*$", re.MULTILINE)
 
 

@@ -17,12 +17,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from mvitac.data.source import Count, Lost, Sample, Source, one_stamp
+from mvitac.data.source import Lost, Sample, Source, one_stamp
 from mvitac.data.spec import MODALITIES, DataSpec, Task
 from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.datasets.touch_and_go import lists, recordings
 from mvitac.datasets.touch_and_go.lists import Frame
-from mvitac.datasets.touch_and_go.recordings import HOMEPAGE, Recording, missing_report
+from mvitac.datasets.touch_and_go.recordings import HOMEPAGE, missing_report
 from mvitac.registry import check_range, to_json
 from mvitac.system.files import digest, digest_file
 
@@ -54,9 +54,6 @@ class TouchAndGoConfig(DatasetConfig):
     """Which images to pack, e.g. touch if only the GelSight videos were downloaded."""
     partial: bool = False
     """Pack the available recordings and list the missing ones, instead of stopping."""
-    unlabelled: int = 0
-    """Also use every n-th unlabelled frame (-1 or not listed) for pre-training, from recordings without test or val
-    frames; 0 = none. Most of these show an untouched gel."""
     test_share: float = 0.25
     """Fraction of recordings in the test split (by-recording)."""
     val_share: float | None = None
@@ -67,7 +64,7 @@ class TouchAndGoConfig(DatasetConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range(self, 0, math.inf, "unlabelled", "split_seed")
+        check_range(self, 0, math.inf, "split_seed")
         if not 0 < self.test_share < 1:
             raise ValueError(f"test_share {self.test_share}: give a share of the recordings in (0, 1)")
         if not 0 <= self.val_part < 1:
@@ -96,10 +93,13 @@ class TouchAndGo(Source):
         listed = lists.read_lists(self._lists)
         if config.split == "official" and listed[0].listed == "label":
             raise ValueError(f"{self._lists} has no train.txt and test.txt, which the official split needs: {lists.AT}")
-        self._num_listed = len(listed)
-        self._num_names = len({frame.recording for frame in listed})
-        found, missing = _find_recordings(config, sorted({frame.recording for frame in listed}))
-        self._missing = missing
+        names = sorted({frame.recording for frame in listed})
+        modalities = MODALITIES if config.modalities == "both" else (config.modalities,)
+        found, missing = recordings.find_recordings(config.root, names, modalities)
+        lacking = missing_report(missing, len(names)) if missing else ""
+        if not found or (missing and not config.partial):
+            hint = "; modalities=touch needs only gelsight" * (config.modalities == "both")
+            raise ValueError(f"{config.root}: {lacking}; fetch them from {HOMEPAGE}, or give partial{hint}")
         listed = [frame for frame in listed if frame.recording not in missing]
         lists.find_touches(listed)
         if config.split == "official":
@@ -107,12 +107,11 @@ class TouchAndGo(Source):
         else:
             lists.assign_by_recording(listed, config.test_share, config.val_part, config.split_seed)
         self._recordings = {recording.name: recording for recording in found}
-        self._chunks = _chunks([*listed, *_unlabelled(listed, found, config)])
+        self._chunks = _chunks(listed)
         frames = [(chunk[0].recording, [frame.number for frame in chunk]) for chunk in self._chunks]
         self._stamps = [one_stamp(self._recordings[name].stamps(numbers)) for name, numbers in frames]
         notes = lists.leaks(listed) if config.split == "official" else []
-        if missing:
-            notes.append(missing_report(missing, self._num_names))
+        notes += [lacking] * bool(missing)
         self._spec = _spec(config, any(frame.rough >= 0 for frame in listed), tuple(notes), bool(missing))
         files = [file for file in sorted(self._lists.glob("*.txt")) if file.name in lists.LIST_FILES]
         self._fingerprint = {
@@ -138,31 +137,6 @@ class TouchAndGo(Source):
     def stamps(self) -> list[int]:
         return self._stamps
 
-    def expected(self) -> list[Count]:
-        """Compare the lists with their published lengths, and with the recordings and frames on disk."""
-        counts = []
-        for name, published in lists.NUM_ROWS.items():
-            if (self._lists / name).is_file():
-                rows = lists.read_list(self._lists / name, len(lists.CLASSES))
-                counts.append(Count(f"rows of {name}", published, len(rows)))
-        absent = missing_report(self._missing, self._num_names) if self._missing else ""
-        counts.append(Count("listed recordings", self._num_names, self._num_names - len(self._missing), absent))
-        there, short = 0, []
-        by_name: dict[str, list[int]] = defaultdict(list)
-        for frame in (f for chunk in self._chunks for f in chunk if f.listed or f.listed_rough):
-            by_name[frame.recording].append(frame.number)
-        for name, numbers in by_name.items():
-            try:
-                end, why = self._recordings[name].num_frames(), ""
-            except (ValueError, OSError) as error:
-                end, why = 0, f" ({error})"
-            there += sum(number < end for number in numbers)
-            if numbers[-1] >= end:
-                short.append(f"{name} has {end} frames, listed up to {numbers[-1]}{why}")
-        rest = f"; and {len(short) - 8} more" if len(short) > 8 else ""
-        counts.append(Count("listed frames in their recordings", self._num_listed, there, "; ".join(short[:8]) + rest))
-        return counts
-
     def read(self, item: int) -> list[Sample | Lost]:
         chunk, lost = self._chunks[item], {}
         recording = self._recordings[chunk[0].recording]
@@ -182,20 +156,6 @@ class TouchAndGo(Source):
         return samples
 
 
-def _find_recordings(config: TouchAndGoConfig, names: list[str]) -> tuple[list[Recording], dict[str, str]]:
-    """Return the recordings to pack, and why each other one of ``names`` cannot be used."""
-    modalities = MODALITIES if config.modalities == "both" else (config.modalities,)
-    found, missing = recordings.find_recordings(config.root, names, modalities)
-    if config.unlabelled:
-        others = sorted(recordings.on_disk(config.root).keys() - set(names))
-        found += recordings.find_recordings(config.root, others, modalities)[0]
-    if not found or (missing and not config.partial):
-        hint = "" if config.modalities != "both" else "; modalities=touch needs only gelsight"
-        advice = f"fetch them from {HOMEPAGE}, or let partial pack what is there{hint}"
-        raise ValueError(f"{config.root}: {missing_report(missing, len(names))}; {advice}")
-    return found, missing
-
-
 def _chunks(frames: Sequence[Frame]) -> list[list[Frame]]:
     """Divide frames into items: up to ``CHUNK`` frames of one recording, ascending."""
     by_name: dict[str, list[Frame]] = defaultdict(list)
@@ -206,32 +166,6 @@ def _chunks(frames: Sequence[Frame]) -> list[list[Frame]]:
         own = sorted(by_name[name], key=lambda frame: frame.number)
         chunks += [own[i : i + CHUNK] for i in range(0, len(own), CHUNK)]
     return chunks
-
-
-def _unlabelled(listed: Sequence[Frame], found: Sequence[Recording], config: TouchAndGoConfig) -> list[Frame]:
-    """Return every n-th unlabelled frame of the recordings without val and test frames."""
-    if not config.unlabelled:
-        return []
-    scored = {f.recording for f in listed if {"val", "test"} & {f.split, f.split_rough if f.rough >= 0 else ""}}
-    known = defaultdict(dict)
-    for frame in listed:
-        known[frame.recording][frame.number] = frame
-    extra = []
-    for recording in found:
-        if recording.name in scored:
-            continue
-        own, start = known[recording.name], 0
-        for number in range(recording.num_frames()):
-            if number in own:
-                start = number + 1  # frames between two touches are a run of their own
-            elif number % config.unlabelled == 0:
-                extra.append(Frame(recording.name, number, touch=start))
-    if not extra:
-        raise ValueError(
-            f"unlabelled {config.unlabelled} adds no frame: recordings with test or val frames give none, and"
-            f" split {config.split} leaves no other with frames to spare; leave it out"
-        )
-    return extra
 
 
 def _columns(frame: Frame, spec: DataSpec) -> dict[str, Any]:

@@ -4,8 +4,6 @@ Each modality of a recording is an mp4 file or a folder of JPEGs named by frame 
 """
 
 import functools
-import os
-import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,7 +14,7 @@ import numpy as np
 
 from mvitac.data.images import decode, shrink
 from mvitac.data.source import Stamp, stamp_of
-from mvitac.data.video import frame_shape, num_frames
+from mvitac.data.video import frame_shape
 from mvitac.data.video import frames as video_frames
 
 HOMEPAGE = "https://touch-and-go.github.io"
@@ -29,10 +27,6 @@ class Recording:
 
     name: str
     places: dict[str, Path]
-
-    def num_frames(self) -> int:
-        """Return the number of frames that all modalities have."""
-        return min(num_frames(p) if p.suffix else _num_jpegs(p) for p in self.places.values())
 
     def state(self) -> list[Any]:
         """Return the recording's files and the sizes of its videos, for the fingerprint."""
@@ -51,34 +45,18 @@ class Recording:
         return {place: stamp_of(str(place)) for place in self.places.values() if place.suffix}
 
 
-def _num_jpegs(folder: Path) -> int:
-    numbers = (int(name[:10]) for name in os.listdir(folder) if re.fullmatch(r"\d{10}\.jpg", name))
-    return 1 + max(numbers, default=-1)
-
-
-def _base(root: Path) -> Path:
-    base = root / "dataset" if (root / "dataset").is_dir() else root
-    if not base.is_dir():
-        raise ValueError(
-            f"{base} is not a folder: give the download (with dataset/ in it) as --data.root; get it from {HOMEPAGE}"
-        )
-    return base
-
-
-def on_disk(root: Path) -> dict[str, str]:
-    """Return recording -> folder; some mirrors append the material, as in 20220319_002026_rock."""
-    names = sorted(entry.name for entry in os.scandir(_base(root)) if entry.is_dir())
-    return {name[:15]: name for name in names if re.fullmatch(r"\d{8}_\d{6}(_.*)?", name)}
-
-
 def find_recordings(
     root: Path, names: Iterable[str], modalities: Sequence[str]
 ) -> tuple[list[Recording], dict[str, str]]:
     """Return the recordings in ``names`` with all ``modalities``, and why each of the others cannot be used."""
-    base, folders = _base(root), on_disk(root)
+    base = root / "dataset" if (root / "dataset").is_dir() else root
+    if not base.is_dir():
+        raise ValueError(f"{base} is not a folder: give the download as --data.root; get it from {HOMEPAGE}")
+    # Some mirrors append the material, as in 20220319_002026_rock.
+    folders = {path.name[:15]: path for path in sorted(base.iterdir()) if path.is_dir()}
     found, missing = [], {}
     for name in names:
-        folder = base / folders.get(name, name)
+        folder = folders.get(name, base / name)
         places, lacking = {}, []
         for modality in modalities:
             movie, images = folder / f"{STEMS[modality]}.mp4", folder / f"{STEMS[modality]}_frame"
