@@ -202,7 +202,7 @@ def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
     evidence = [f"{share(int(whole.sum()), pack.num)} rows have all frames before them, by column {name}"]
     advice = []
     if any(gaps):
-        evidence.append(f"{sum(gaps)} gaps in {share(np.count_nonzero(gaps), len(gaps))} touches")
+        evidence.append(f"{sum(gaps)} gaps in {share(sum(map(bool, gaps)), len(gaps))} touches")
         advice.append("a window across a gap shows an older frame than asked: split the touches there")
     if rates and max(rates) > 1.25 * min(rates):
         evidence.append(f"frames are {min(rates):.3g} apart in some touches and {max(rates):.3g} in others")
