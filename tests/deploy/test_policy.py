@@ -1,15 +1,8 @@
-"""The encoders inside a policy, and the ROS 2 node on a fake publisher."""
+"""The encoders inside a policy."""
 
-import json
-import sys
 from dataclasses import replace
-from operator import attrgetter
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
-from unittest.mock import MagicMock
 
-import numpy as np
 import pytest
 import torch
 
@@ -17,8 +10,6 @@ import mvitac
 from mvitac.data.pack import Pack
 from mvitac.deploy.policy import ObservationEncoder
 from mvitac.model import Model
-from support.examples import load_example
-from support.faults import Clock, Rig
 
 KEYS = {"observation.images.wrist": "vision", "observation.images.gel": "touch"}
 
@@ -88,59 +79,3 @@ def test_what_does_not_fit_is_named(model: Model, pack: Pack) -> None:
     for wrong in (not_divided, normalised_already):
         with pytest.raises(ValueError, match=r"expected floats in \[0, 1\] or uint8"):
             encoder(wrong)
-
-
-def message(image: np.ndarray, encoding: str, pad: int = 5) -> SimpleNamespace:
-    """A sensor_msgs/Image with padded rows."""
-    height, width, _ = image.shape
-    pixels = image[..., ::-1] if encoding == "bgr8" else image
-    rows = np.concatenate([pixels.reshape(height, -1), np.full((height, pad), 99, np.uint8)], axis=1)
-    return SimpleNamespace(height=height, width=width, step=3 * width + pad, encoding=encoding, data=rows.tobytes())
-
-
-def test_the_ros_node(onnx: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Its topics, answers and log, where ``rclpy.spin`` sends what a camera and a gel would: calibrates in 0.6 s, touched
-    from 1.0 s on, and silent at the end."""
-    ros2_node = load_example("ros2_node")
-    clock, ros, rclpy = Clock(), MagicMock(), MagicMock()
-    rigs = {"/camera": (Rig(clock, 1), "rgb8"), "/gel": (Rig(clock, 2), "bgr8")}
-
-    def spin(node: Any) -> None:
-        callbacks = {topic: callback for _, topic, callback, _ in map(attrgetter("args"), subscribed.call_args_list)}
-        for frame in range(80):
-            clock.now = 99 + frame / 50
-            for topic, (rig, encoding) in rigs.items():
-                callbacks[topic](message(rig.read(), encoding))
-        clock.now += 5
-        ros.create_timer.call_args.args[1]()
-        callbacks["/gel"](SimpleNamespace(encoding="mono8"))
-
-    rclpy.create_node.return_value, rclpy.spin, subscribed = ros, spin, ros.create_subscription
-    for name in ("rclpy", "rclpy.qos", "sensor_msgs.msg", "std_msgs.msg"):
-        monkeypatch.setitem(sys.modules, name, rclpy)
-    monkeypatch.setattr(ros2_node.Node.__init__, "__kwdefaults__", {"warn": print, "clock": clock})
-    monkeypatch.setattr(sys, "argv", ["ros2_node.py", str(onnx), "--vision", "/camera", "--touch", "/gel"])
-    ros2_node.main()
-    assert [call.args[1] for call in ros.create_publisher.call_args_list] == ["~/prediction", "~/embedding"]
-    assert rclpy.QoSProfile.call_args.kwargs["depth"] == 1  # a queue would hand over old frames as new ones
-    *said, last = (json.loads(call.kwargs["data"]) for call in rclpy.String.call_args_list)
-    embeddings = [call.kwargs["data"] for call in rclpy.Float32MultiArray.call_args_list]
-    assert len(said) == len(embeddings) == pytest.approx(30, abs=2) and len(embeddings[0]) == 128
-    assert set(said[0]) == {"touch", "contact", "age_ms", "pattern", "bright"} and said[0]["touch"] == 1
-    assert said[0]["contact"] and said[0]["pattern"]["class"] in ("columns", "rows", "checks")
-    assert said[0]["age_ms"] == 0  # the fake clock stands still meanwhile
-    assert last == {"touch": 1, "contact": False}
-    calibrated, *silent, unread = (call.args[0] for call in ros.get_logger().warning.call_args_list)
-    assert calibrated == "touch 0 is calibrated without contact" and "publish rgb8 or bgr8" in unread
-    assert sorted(silent) == ["touch 0 gives no frames since 5.0 s", "vision 0 gives no frames since 5.0 s"]
-    monkeypatch.setattr(sys, "argv", ["ros2_node.py", str(onnx), "--vision", "/camera"])
-    with pytest.raises(SystemExit):
-        ros2_node.main()
-    assert "the model needs 1 touch topic(s): give --touch TOPIC" in capsys.readouterr().err
-
-
-def test_a_message_is_read_as_rgb() -> None:
-    image = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
-    to_rgb = load_example("ros2_node").to_rgb
-    for encoding in ("rgb8", "bgr8"):
-        assert np.array_equal(to_rgb(message(image, encoding)), image)

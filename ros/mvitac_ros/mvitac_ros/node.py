@@ -1,146 +1,140 @@
-"""A ROS 2 node that subscribes to image topics and publishes predictions and embeddings.
+"""A ROS 2 node: image topics in, predictions and embeddings out, at a fixed rate and under the time of the images.
 
-    python examples/ros2_node.py exports/first --vision /camera/image_raw --touch /gel/image_raw
+    ros2 run mvitac_ros node --ros-args -p export:=exports/first -p vision:=/camera/image_raw -p touch:=/gel/image_raw
 
-It subscribes to sensor_msgs/Image (rgb8 or bgr8), and publishes std_msgs/String on ~/prediction and
-std_msgs/Float32MultiArray on ~/embedding. A prediction is JSON: number of the touch, contact (true; false once, when
-the contact ends), age in ms, and for each task its class and confidence, or the value, unit and spread (usual error) of
-each target. Errors are written to the node's log.
-
-Only ``main`` needs ROS. ``Node`` accepts any object with the fields of an Image message, so it can be tested without
-ROS.
+Only ``main`` needs ROS. Parameters, topics and messages are described in docs/policies.md.
 """
 
-from __future__ import annotations
-
-import argparse
+import array
+import io
 import json
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
+from mvitac.data.images import decode, ros_pixels
 from mvitac.deploy.engine import Engine, frame_shapes
 from mvitac.live.cameras import Source
 from mvitac.live.predictor import Live
 from mvitac.live.streams import Stream
 
 
-def to_rgb(message: Any) -> np.ndarray:
-    """Convert a sensor_msgs/Image to uint8 RGB [H, W, 3]. Rows may be padded.
-
-    Raises:
-        ValueError: The encoding is not rgb8 or bgr8.
-    """
-    if message.encoding not in ("rgb8", "bgr8"):
-        raise ValueError(f"encoding {message.encoding!r}: publish rgb8 or bgr8")
-    rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
-    image = rows[:, : 3 * message.width].reshape(message.height, message.width, 3)
-    return np.ascontiguousarray(image[..., ::-1] if message.encoding == "bgr8" else image)
-
-
 class Topic(Source):
-    """A topic as a camera source. Call ``put`` with each message, then pump the stream."""
+    """The newest message of an image topic, captured at the time in its header (0: when it arrived)."""
 
-    def __init__(self) -> None:
-        self.message: Any = None
+    message: Any = None
+    header: Any = None  # of the message that was read last
 
     def open(self) -> None:
         pass
 
-    def put(self, message: Any) -> None:
-        self.message = message
-
     def read(self) -> np.ndarray:
-        return to_rgb(self.message)
+        found = ros_pixels(self.message, "an image")
+        image = np.array(decode(io.BytesIO(found), "an image")) if isinstance(found, bytes) else found
+        if image.dtype != np.uint8:
+            raise ValueError(f"encoding {self.message.encoding}: publish 8 bits per channel")
+        self.header, stamp = self.message.header, self.message.header.stamp
+        self.captured = stamp.sec + 1e-9 * stamp.nanosec or None
+        return np.ascontiguousarray(np.broadcast_to(image, (*image.shape[:2], 3)))
 
 
 class Node:
-    """Take image messages and call ``publish(kind, value)``: "prediction" (str) or "embedding" (list of float)."""
+    """``image`` takes a message; ``tick`` calls ``publish(header, prediction, embedding [D] or None)`` if there is news."""
 
     def __init__(
         self,
         engine: Engine,
-        publish: Callable[[str, Any], None],
+        publish: Callable[[Any, dict[str, Any], np.ndarray | None], None],
+        clock: Callable[[], float],
+        warn: Callable[..., Any],
         *,
-        warn: Callable[[str], None] = print,
-        clock: Callable[[], float] = time.monotonic,
+        always: bool = False,
+        free: Sequence[np.ndarray] = (),
     ) -> None:
-        self.publish, self.outputs = publish, {}
-        self.topics = {m: [Topic() for _ in range(shape[2] // 3)] for m, shape in frame_shapes(engine).items()}
+        """``clock`` is that of the headers, in seconds; ``always`` and ``free`` as of ``Live``."""
+        self.publish, self.clock, self.warn = publish, clock, warn
         self.streams = {
-            m: [Stream(f"{m} {i}", topic, clock=clock) for i, topic in enumerate(topics)]
-            for m, topics in self.topics.items()
+            m: [Stream(f"{m} {i}", Topic(), clock=clock) for i in range(shape[2] // 3)]
+            for m, shape in frame_shapes(engine).items()
         }
-        # Live does not return embeddings, so the last outputs of the engine are kept to publish them.
-        self.live = Live(Kept(engine, self.outputs), self.streams, clock=clock, tell=lambda event: warn(event.text))  # type: ignore[arg-type]
+        self.live = Live(
+            engine,
+            self.streams,
+            clock=clock,
+            tell=lambda event: warn(event.text),
+            nearest=self._keep,
+            always=always,
+            free=free,
+        )
 
-    def image(self, modality: str, message: Any, which: int = 0) -> None:
-        """Take one Image message, and publish if there is a new prediction."""
-        self.topics[modality][which].put(message)
-        self.streams[modality][which].pump()
-        self.tick()
+    def _keep(self, outputs: dict[str, np.ndarray]) -> list[str]:
+        self.embedding = np.concatenate([v[0] for name, v in outputs.items() if name.startswith("embedding_")])
+        return []
+
+    def image(self, modality: str, which: int, message: Any) -> None:
+        """Make ``message`` the newest of camera or sensor ``which`` of ``modality``."""
+        stream = self.streams[modality][which]
+        topic: Any = stream.origin
+        topic.message = message
+        stream.pump()
+        age = self.clock() - (topic.captured or self.clock())
+        if abs(age) > stream.stale_after:
+            text = f"{stream.name}: images are {age:.1f} s old by their headers; are both clocks the same?"
+            self.warn(text, throttle_duration_sec=10.0)
 
     def tick(self) -> None:
-        """Publish new results. Also called by a timer, because a topic that stops sends no message."""
-        said = self.live.step()
-        if said:
-            self.publish("prediction", json.dumps(said))
-        if said and said["contact"]:
-            names = [n for n in self.outputs if n.startswith("embedding_")]
-            self.publish("embedding", np.concatenate([self.outputs[n][0] for n in names]).tolist())
-
-
-class Kept:
-    """An engine that stores its last outputs in a dict."""
-
-    def __init__(self, engine: Engine, outputs: dict[str, np.ndarray]) -> None:
-        self.engine, self.outputs, self.inputs, self.classes = engine, outputs, engine.inputs, engine.classes
-        self.values, self.difference, self.window = engine.values, engine.difference, engine.window
-
-    def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
-        self.outputs.update(self.engine(**images))
-        return self.outputs
+        """Predict from the newest images, if there are new ones."""
+        if said := self.live.step():
+            topic: Any = self.live.leading.origin
+            stamp = topic.header.stamp
+            said = {"stamp": {"sec": stamp.sec, "nanosec": stamp.nanosec}, **said}
+            self.publish(topic.header, said, self.embedding if self.live.answer else None)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("export", help="folder written by `mvitac export`")
-    parser.add_argument("--vision", action="append", default=[], help="image topic of the camera")
-    parser.add_argument(
-        "--touch", action="append", default=[], help="image topic of a touch sensor; give it twice for two"
-    )
-    options, rest = parser.parse_known_args()
-    engine = Engine(options.export)
-    for modality in ("vision", "touch"):
-        takes = frame_shapes(engine).get(modality, (0, 0, 0))[2] // 3
-        if len(getattr(options, modality)) != takes:
-            parser.error(f"the model needs {takes} {modality} topic(s): give --{modality} TOPIC {takes} times")
-
     import rclpy  # pyright: ignore[reportMissingImports]
     from rclpy.qos import QoSProfile, ReliabilityPolicy  # pyright: ignore[reportMissingImports]
-    from sensor_msgs.msg import Image  # pyright: ignore[reportMissingImports]
-    from std_msgs.msg import Float32MultiArray, String  # pyright: ignore[reportMissingImports]
+    from sensor_msgs.msg import CompressedImage, Image  # pyright: ignore[reportMissingImports]
+    from std_msgs.msg import String  # pyright: ignore[reportMissingImports]
 
-    rclpy.init(args=rest)
+    rclpy.init()
     ros = rclpy.create_node("mvitac")
-    publishers = {
-        "prediction": (ros.create_publisher(String, "~/prediction", 10), String),
-        "embedding": (ros.create_publisher(Float32MultiArray, "~/embedding", 10), Float32MultiArray),
-    }
 
-    def publish(kind: str, value: Any) -> None:
-        publisher, message = publishers[kind]
-        publisher.publish(message(data=value))
+    def parameter(name: str, default: Any = "") -> Any:
+        return ros.declare_parameter(name, default).value
 
-    node = Node(engine, publish, warn=ros.get_logger().warning)
+    engine = Engine(parameter("export"))
+    topics = {modality: parameter(modality).split() for modality in ("vision", "touch")}
+    for modality, given in topics.items():
+        takes = frame_shapes(engine).get(modality, (0, 0, 0))[2] // 3
+        if len(given) != takes:
+            raise SystemExit(f"the model needs {takes} {modality} topic(s), parameter {modality} has {len(given)}")
+    predictions = ros.create_publisher(String, "~/prediction", 10)
+    embeddings = ros.create_publisher(Image, "~/embedding", 10)
+
+    def publish(header: Any, said: dict[str, Any], embedding: np.ndarray | None) -> None:
+        predictions.publish(String(data=json.dumps(said)))
+        if embedding is not None:
+            data = array.array("B", embedding.astype("<f4").tobytes())
+            shape = {"height": 1, "width": len(embedding), "step": len(data)}
+            embeddings.publish(Image(header=header, encoding="32FC1", is_bigendian=0, data=data, **shape))
+
+    node = Node(
+        engine,
+        publish,
+        lambda: 1e-9 * ros.get_clock().now().nanoseconds,
+        ros.get_logger().warning,
+        always=parameter("always", False),
+        free=[np.array(decode(path)) for path in parameter("background").split()],
+    )
     # Keep only the newest message: the usual sensor profile queues five and delivers the oldest first.
     newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-    for modality, topics in (("vision", options.vision), ("touch", options.touch)):
-        for which, topic in enumerate(topics):
-            ros.create_subscription(Image, topic, lambda m, k=modality, i=which: node.image(k, m, i), newest)
-    ros.create_timer(0.1, node.tick)
+    for modality, given in topics.items():
+        for which, topic in enumerate(given):
+            kind = CompressedImage if topic.endswith("/compressed") else Image
+            ros.create_subscription(kind, topic, lambda m, of=(modality, which): node.image(*of, m), newest)
+    ros.create_timer(1 / parameter("rate", 30.0), node.tick)
     try:
         rclpy.spin(ros)
     finally:

@@ -4,7 +4,7 @@ import re
 import struct
 from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import simplejpeg
@@ -124,3 +124,25 @@ def difference(image: np.ndarray, background: np.ndarray) -> np.ndarray:
         (h, w), (h2, w2) = image.shape[:2], background.shape[:2]
         raise ValueError(f"image is {w} x {h}, its background {w2} x {h2}: a difference needs one size")
     return ((image.astype(np.int16) - background + 256) >> 1).astype(np.uint8)
+
+
+ROS_CHANNELS = {"mono": 1, "8UC1": 1, "16UC1": 1, "32FC1": 1, "bgr": 3, "rgb": 3, "8UC3": 3, "bgra": 4, "rgba": 4}
+
+
+def ros_pixels(message: Any, name: str) -> bytes | np.ndarray:
+    """The file in a sensor_msgs CompressedImage, or the numbers [H, W, 1 or 3] of an Image, red first.
+
+    Raises:
+        ValueError: ``name`` has an encoding that is not read, or a wrong length.
+    """
+    if not hasattr(message, "encoding"):
+        return bytes(message.data)
+    code = message.encoding
+    channels = ROS_CHANNELS.get(code) or ROS_CHANNELS.get(code.rstrip("168"), 0)
+    kind = np.dtype(np.float32 if "32F" in code else np.uint16 if "16" in code else np.uint8)
+    if not channels:
+        raise ValueError(f"{name} has the encoding {code}: {', '.join(ROS_CHANNELS)} are read")
+    kind = kind.newbyteorder(">" if message.is_bigendian else "<")
+    lines = np.frombuffer(message.data, kind).reshape(message.height, -1)[:, : message.width * channels]  # padded
+    pixels = lines.reshape(message.height, message.width, channels)[:, :, :3]
+    return pixels[:, :, ::-1] if code.startswith("bgr") else pixels

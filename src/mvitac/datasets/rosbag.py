@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from mvitac.data.images import ros_pixels
 from mvitac.datasets.table.clocks import joined, nearest
 from mvitac.datasets.table.columns import element_of
 from mvitac.datasets.table.folders import recording_row
@@ -23,8 +24,6 @@ from mvitac.datasets.table.manifest import Manifest, Row, text_of
 from mvitac.datasets.table.table import RecordedConfig
 from mvitac.registry import unknown
 from mvitac.system.files import brief
-
-CHANNELS = {"mono": 1, "8UC1": 1, "16UC1": 1, "32FC1": 1, "bgr": 3, "rgb": 3, "8UC3": 3, "bgra": 4, "rgba": 4}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,18 +173,4 @@ class Message(ImageRef):
     def stored(self, container: tuple[Any, Iterator[Any]]) -> bytes | np.ndarray:
         reader, messages = container
         connection, _, raw = next(found for found in messages if found[1] == self.stamp)
-        return _pixels(reader.deserialize(raw, connection.msgtype), str(self))
-
-
-def _pixels(message: Any, name: str) -> bytes | np.ndarray:
-    """Return the file in a CompressedImage, or the numbers [H, W, 1 or 3] of an Image, red first."""
-    if not hasattr(message, "encoding"):
-        return message.data.tobytes()
-    code = message.encoding
-    channels = CHANNELS.get(code) or CHANNELS.get(code.rstrip("168"), 0)
-    kind = np.dtype(np.float32 if "32F" in code else np.uint16 if "16" in code else np.uint8)
-    if not channels:
-        raise ValueError(f"{name} has the encoding {code}: {', '.join(CHANNELS)} are read")
-    lines = message.data.view(kind.newbyteorder(">" if message.is_bigendian else "<")).reshape(message.height, -1)
-    pixels = lines[:, : message.width * channels].reshape(message.height, message.width, channels)[:, :, :3]
-    return pixels[:, :, ::-1] if code.startswith("bgr") else pixels
+        return ros_pixels(reader.deserialize(raw, connection.msgtype), str(self))

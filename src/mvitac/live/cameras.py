@@ -26,6 +26,7 @@ class Source(ABC):
 
     fps: float = 30.0  # nominal rate
     paced: bool = True  # whether ``read`` itself waits for the next frame
+    captured: float | None = None  # when the newest frame was, by the stream's clock; None: when it was read
     sensor: str = ""  # name of the touch sensor, as in column sensor of packs; "" = not known
 
     @abstractmethod

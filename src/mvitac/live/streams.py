@@ -128,7 +128,7 @@ class Stream:
     def check(self) -> None:
         """Report a device that has stopped giving frames; ``pump`` cannot, as it waits for the device."""
         now = self.clock()
-        last = max(self._opened_at, self._newest.time) if self._newest else self._opened_at
+        last = max((self._opened_at, *self._arrivals))
         if self._open and not self.ended and self.fault != "stalled" and now - last > self.stale_after:
             self._say("stalled", f"gives no frames since {now - last:.1f} s")
 
@@ -137,8 +137,9 @@ class Stream:
         self._open = False
 
     def take(self, image: np.ndarray) -> None:
-        """Make ``image`` the newest frame, now."""
+        """Make ``image`` the newest frame, captured when its source says, or now."""
         now, before = self.clock(), self._newest
+        captured = now if self.origin.captured is None else self.origin.captured
         changed = before is not None and before.image.shape != image.shape
         if self.fault in ("unplugged", "stalled"):
             self._recovered()
@@ -155,12 +156,12 @@ class Stream:
         self._arrivals.append(now)
         with self._lock:
             self.num_dropped += not self._taken
-            self._newest, self._taken = Frame(image, now, self.num_frames), False
+            self._newest, self._taken = Frame(image, captured, self.num_frames), False
             if self._side:
                 if changed:
                     self._past.clear()  # another lens or crop
-                self._past.append((now, fit(image, self._side)))
-                while len(self._past) > 1 and self._past[1][0] <= now - self._keep:
+                self._past.append((captured, fit(image, self._side)))
+                while len(self._past) > 1 and self._past[1][0] <= captured - self._keep:
                     self._past.popleft()
 
     def _lost(self, error: Exception) -> None:
