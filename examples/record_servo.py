@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.control.servo import SIZE, STEP_MM, Episode, task_of
+from mvitac.control.find import find_suite
+from mvitac.control.servo import SIZE, STEP_MM, task_of
 from mvitac.data.build import build
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Target, ValueTask
@@ -48,16 +49,16 @@ class Recorded(Source):
 
     def read(self, item: int) -> list[Sample]:
         name, rng, made = self.items()[item], np.random.default_rng(item), []
-        episode = Episode.begin(0, self.kind, int(name))
+        episode = find_suite("servo-v1").world(self.kind, "known sensor", int(name))
         task, split = episode.task, "train" if item % 5 else "test"
         for frame in range(STEPS):
-            action = -GAIN * (episode.pose - task.target)
+            action = -GAIN * (episode.known - task.target)
             columns = {"id": f"{name}-{frame:03d}", "group": name, "touch_group": name, "split": split, "frame": frame}
             columns |= {"contact": not episode.lost, "along_mm": STEP_MM * frame} | dict(
                 zip(task.names, action.tolist(), strict=True)
             )
-            made.append(Sample(vision=None, touch=episode.touch(), columns=columns))
-            episode.move(action + 0.1 * task.start * rng.standard_normal(len(action)))  # corrections are shown, too
+            made.append(Sample(vision=None, touch=episode.look("touch"), columns=columns))
+            episode.step(action + 0.1 * task.start * rng.standard_normal(len(action)))  # corrections are shown, too
         return made
 
 

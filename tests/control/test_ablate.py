@@ -2,15 +2,19 @@
 
 import copy
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
+from PIL import Image
 
 from mvitac.cli.main import main
-from mvitac.control.ablate import ablate, act, open_policy, read_episodes
+from mvitac.control.ablate import Recorded, ablate, act, open_policy, read_episodes, suite_episodes, suite_policy
+from mvitac.control.find import find_suite
+from mvitac.control.video import film, write_film
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample, Source
@@ -104,9 +108,10 @@ def test_verdicts(pack: Pack, policy: Any, touch: str, vision: str) -> None:
 
 def test_each_replacement_gives_what_it_says(pack: Pack) -> None:
     episodes = read_episodes(pack)
-    force = np.stack([episodes.actions[rows, 0] for rows in episodes.rows])
+    assert episodes.actions is not None
+    force = episodes.actions[:, 0].reshape(-1, STEPS)
     kinds = ("", "mean frame", "another episode", "10 frames ago", "noise")
-    felt = {k: np.stack([act(needs, episodes, "touch", k)[rows, 0] for rows in episodes.rows]) for k in kinds}
+    felt = {k: act(needs, episodes, "touch" * bool(k), k)[0][:, 0].reshape(-1, STEPS) for k in kinds}
     assert np.abs(felt[""] - force).max() < 1.5
     assert np.allclose(felt["mean frame"], force.mean(), atol=1.5)
     assert np.abs(felt["another episode"] - np.roll(force, -1, axis=0)).max() < 1.5
@@ -119,7 +124,10 @@ def test_numbers_that_would_be_wrong(pack: Pack) -> None:
     """Values named as a sense never hide a replacement; a component that never changes counts as 0, whatever is given."""
     episodes = read_episodes(pack)
     still = np.full((pack.num, 1), 0.1)
-    named = replace(episodes, actions=np.hstack([episodes.actions, still]), more={"touch": still, **episodes.more})
+    assert episodes.actions is not None
+    clock = pack.values(next(task for task in pack.spec.values if task.name == "state"))
+    begin = [partial(Recorded, pack, rows, {"touch": still, "state": clock}) for rows in episodes.rows]
+    named = replace(episodes, actions=np.hstack([episodes.actions, still]), begin=begin)
     result = ablate(lambda o: [*needs(o), 0.1 + 1e-9 * o["touch"].mean()], named)
     plain = ablate(needs, episodes)
     for row, other in zip(result["rows"], plain["rows"], strict=True):
@@ -132,8 +140,8 @@ def test_contact_is_the_column_where_there_is_one(pack: Pack, cells: list[Any]) 
     made = copy.copy(pack)
     asked = np.arange(pack.num) % 3 > 0
     made.table = pack.table.append_column("contact", pa.array([cells[one] for one in asked.astype(int)]))
-    assert np.array_equal(read_episodes(made).touched(), asked)
-    assert not np.array_equal(read_episodes(pack).touched(), asked)
+    assert np.array_equal(read_episodes(made).touched, asked)
+    assert not np.array_equal(read_episodes(pack).touched, asked)
 
 
 def test_in_contact_and_over_time(pack: Pack) -> None:
@@ -141,6 +149,37 @@ def test_in_contact_and_over_time(pack: Pack) -> None:
     worse = next(row for row in rows if row["sense"] == "touch" and row["kind"] == "another episode")["parts"]
     assert worse["in contact"][0] > 3 * abs(worse["no contact"][0])
     assert worse["last"][0] > worse["first third"][0]
+
+
+def test_in_a_closed_loop_success_is_the_measure() -> None:
+    """A policy that knows each episode by its gel needs it; one that knows nothing of it does not use it."""
+    suite = replace(find_suite("insert-v1"), episodes=8)
+    known = {w.look("touch").tobytes(): w.known for w in (suite.world("both", "30", n) for n in range(suite.num))}
+    felt = ablate(lambda o: known.get(o["touch"].tobytes(), np.zeros(2)), suite_episodes(suite, ("both", "30")))
+    assert felt["verdicts"]["touch"].startswith("The policy uses touch")
+    assert felt["verdicts"]["vision"].startswith("The policy does not use vision")
+    changes = {row["kind"]: row["error"][0] for row in felt["rows"] if row["sense"] == "touch"}
+    assert felt["error"][0] == 0 and changes["10 frames ago"] == 0  # the grasp does not change
+    assert all(changes[kind] > 0.6 for kind in ("another episode", "mean frame", "noise"))
+    blind = ablate(lambda o: [5.0, 0.0], suite_episodes(suite, ("both", "30")))
+    assert blind["verdicts"]["touch"].startswith("The policy does not use touch") and blind["error"][0] > 0.8
+
+
+def test_film_and_learned_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    suite = replace(find_suite("insert-v1"), episodes=3, demonstrations=(4,))
+    episodes = suite_episodes(suite, ("touch", "4"))
+    result = ablate(suite_policy(suite, ("touch", "4"), "pixels"), episodes)
+    assert [row["sense"] for row in result["rows"]] == ["touch"] * 4 and result["unit"] == "failures"
+    pictures = film(episodes, [("expert", None, ""), ("none", lambda o: [0.0, 0.0], "mean frame")])
+    write_film(tmp_path / "a.webp", pictures)
+    with Image.open(tmp_path / "a.webp") as made:
+        assert made.n_frames == 18 and made.size == (384, 256)
+    write_film(tmp_path / "a.jpg", pictures)
+    with Image.open(tmp_path / "a.jpg") as made:
+        assert made.height == 5 * 256
+    for text, why in (("insert-v1/touch/31", "unknown task and condition"), ("nowhere", "--out is a film of a suite")):
+        assert main(["ablate", "pixels", "--data", text, "--out", str(tmp_path / "b.webp")]) == 2
+        assert why in capsys.readouterr().err
 
 
 def test_command(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,15 +13,14 @@ import pytest
 from mvitac.bench.encoder import About
 from mvitac.bench.result import VOLATILE
 from mvitac.control import result
-from mvitac.control.insert import Insertion
-from mvitac.control.insert_rows import Insert
+from mvitac.control.find import find_suite
+from mvitac.control.insert import Insert, Insertion
 from mvitac.control.learn import ridge
-from mvitac.control.result import find_suite
-from mvitac.control.suite import Row
+from mvitac.control.suite import Row, score
 from mvitac.system.files import digest
 
 RANDOM = "external:timm/test_resnet,weights=random,size=32,seed={}"
-CRITERIA = (1.0, 3.0, 0.7)
+WHOLE: Any = find_suite("insert-v1")
 
 
 @pytest.fixture(scope="module")
@@ -34,43 +33,49 @@ def ends(known: Any, num: int = 8) -> np.ndarray:
     """Success, mm and degrees of episodes in which the hand goes where ``known`` says."""
     found = []
     for number in range(num):
-        world = Insertion(0, number)
+        world = Insertion(WHOLE, number)
         while not world.over:
             world.step(known(world))
-        found.append(world.result(*CRITERIA))
+        found.append(world.result())
     return np.array(found, float)
 
 
 def test_the_expert_succeeds_and_half_of_its_knowledge_does_not() -> None:
-    assert ends(lambda world: world.wanted)[:, 0].all()
+    assert ends(lambda world: world.known)[:, 0].all()
     assert ends(lambda world: np.array([world.slot_mm, 0.0]))[:, 0].mean() < 0.3
-    assert ends(lambda world: world.wanted - [world.slot_mm, 0.0])[:, 0].mean() < 0.3
+    assert ends(lambda world: world.known - [world.slot_mm, 0.0])[:, 0].mean() < 0.3
 
 
 def test_criteria_are_those_of_the_suite() -> None:
-    world = Insertion(0, 1)
+    world = Insertion(WHOLE, 1)
     while not world.over:
-        world.step(world.wanted + np.array([0.5, 0.0]))
-    success, mm, deg = world.result(*CRITERIA)
+        world.step(world.known + np.array([0.5, 0.0]))
+    success, mm, deg = world.result()
     assert success and 0.05 < mm < 0.7
-    assert not world.result(mm / 2, 3.0, 0.7)[0]
-    assert not world.result(1.0, 3.0, 1.2)[0]
-    assert world.result(1.0, deg + 1e-6, 0.7)[0]
+    others: list[tuple[dict[str, Any], bool]] = [
+        ({"success_mm": mm / 2}, False),
+        ({"success_depth": 1.2}, False),
+        ({"success_deg": deg / 2}, False),
+        ({"success_deg": deg + 1e-6}, True),
+    ]
+    for criteria, holds in others:
+        world.suite = replace(WHOLE, **criteria)
+        assert world.result()[0] == holds
 
 
 def test_only_the_camera_shows_the_slot_and_only_the_gel_the_peg() -> None:
-    world = Insertion(0, 3)
-    before, peg = world.see(), world.model.geom("peg").id
+    world = Insertion(WHOLE, 3)
+    before, peg = world.look("vision"), world.model.geom("peg").id
     world.model.geom_size[peg] *= 2
     mujoco.mj_forward(world.model, world.data)
-    assert np.array_equal(world.see(), before)
+    assert np.array_equal(world.look("vision"), before)
     world.model.geom_pos[world.model.geom("block0").id, 0] += 0.004
     mujoco.mj_forward(world.model, world.data)
-    assert np.abs(world.see().astype(int) - before).mean() > 1
-    other = Insertion(0, 4)
-    assert np.abs(other.touch().astype(int) - world.touch()).mean() > 1
-    other.step(other.wanted)
-    assert np.array_equal(other.touch(), Insertion(0, 4).touch())
+    assert np.abs(world.look("vision").astype(int) - before).mean() > 1
+    other = Insertion(WHOLE, 4)
+    assert np.abs(other.look("touch").astype(int) - world.look("touch")).mean() > 1
+    other.step(other.known)
+    assert np.array_equal(other.look("touch"), Insertion(WHOLE, 4).look("touch"))
 
 
 def test_demonstrations_are_other_grasps_and_go_astray(small: Insert) -> None:
@@ -78,19 +83,21 @@ def test_demonstrations_are_other_grasps_and_go_astray(small: Insert) -> None:
     wanted = actions.reshape(5, -1, 2)
     assert np.ptp(wanted, axis=1).max() == 0  # the set point does not change within an episode
     for number in range(5):
-        assert np.abs(wanted[:, 0] - Insertion(0, number).wanted).max(1).min() > 0.01
-    world = Insertion(0, 0, trained=True)
-    assert np.array_equal(images["vision"][0], world.see()) and np.array_equal(images["touch"][0], world.touch())
+        assert np.abs(wanted[:, 0] - Insertion(WHOLE, number).known).max(1).min() > 0.01
+    world = Insertion(WHOLE, 0, trained=True)
+    assert np.array_equal(images["vision"][0], world.look("vision")) and np.array_equal(
+        images["touch"][0], world.look("touch")
+    )
     for _ in range(4):
-        world.step(world.wanted)
-    assert np.abs(images["vision"][4].astype(int) - world.see()).mean() > 1
+        world.step(world.known)
+    assert np.abs(images["vision"][4].astype(int) - world.look("vision")).mean() > 1
 
 
 def test_the_suite_shows_what_was_measured() -> None:
     """Mean levels: another processor rounds a pixel otherwise, another scene does not come near."""
-    worlds = [Insertion(0, 1, trained=trained) for trained in (True, False)]
-    assert [world.see().mean() for world in worlds] == pytest.approx([171.35, 176.50], abs=0.05)
-    assert [world.touch().mean() for world in worlds] == pytest.approx([140.716, 140.725], abs=0.004)
+    worlds = [Insertion(WHOLE, 1, trained=trained) for trained in (True, False)]
+    assert [world.look("vision").mean() for world in worlds] == pytest.approx([171.35, 176.50], abs=0.05)
+    assert [world.look("touch").mean() for world in worlds] == pytest.approx([140.716, 140.725], abs=0.004)
 
 
 def test_gymnasium_environment() -> None:
@@ -104,8 +111,8 @@ def test_gymnasium_environment() -> None:
     seen, info = env.reset(seed=1)
     over = False
     while not over:
-        seen, reward, over, _, info = env.step((env.world.wanted / mvitac.control.env.FARTHEST).astype(np.float32))
-    assert reward == info["success"] == 1 and seen["vision"].shape == seen["touch"].shape
+        seen, reward, over, _, info = env.step((info["known"] / env.world.most).astype(np.float32))
+    assert reward == 1 and seen["vision"].shape == seen["touch"].shape and mvitac.control.env.LoopEnv
 
 
 def test_a_result_holds_until_it_is_changed(small: Insert, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,16 +140,16 @@ def test_regression_finds_what_pictures_show(small: Insert) -> None:
     known = {images[sense][row].tobytes(): actions[row] for sense in images for row in range(len(actions))}
 
     def oracle(modality: str, pictures: np.ndarray) -> np.ndarray:
-        worlds = {Insertion(0, n).touch().tobytes(): Insertion(0, n).wanted for n in range(4)}
+        worlds = {Insertion(WHOLE, n).look("touch").tobytes(): Insertion(WHOLE, n).known for n in range(4)}
         return np.stack([known.get(p.tobytes(), worlds.get(p.tobytes(), np.zeros(2))) for p in pictures])
 
-    cells = {cell["task"]: cell for cell in few.score(Row("", 0, ridge(oracle)))}
+    cells = {cell["task"]: cell for cell in score(few, Row("", 0, ridge(oracle)))}
     assert all(cells["touch"]["success"]) and not all(cells["vision"]["success"])
-    shuffled = {cell["task"]: cell for cell in few.score(Row("touch shuffled", 0, ridge(oracle)))}
+    shuffled = {cell["task"]: cell for cell in score(few, Row("touch shuffled", 0, ridge(oracle)))}
     assert not any(shuffled["touch"]["success"])
     looks: list[Callable[[str], np.ndarray]] = []
     for source in ("", "touch shuffled"):
-        few.score(Row(source, 0, lambda *_: lambda look: looks.append(look) or np.zeros(2)))
+        score(few, Row(source, 0, lambda *_: lambda look: looks.append(look) or np.zeros(2)))
     for sense, other in (("vision", 0), ("touch", 1)):
         plain, given = (look(sense) for look in (looks[0], looks[-1]))
         assert np.array_equal(given, np.roll(plain, other, axis=0)) and not np.array_equal(plain, np.roll(plain, 1, 0))

@@ -14,14 +14,18 @@ from mvitac.bench.external import open_model
 from mvitac.bench.result import VOLATILE
 from mvitac.cli.main import main
 from mvitac.control import result
-from mvitac.control.result import find_suite
-from mvitac.control.servo import TASKS, Edge, Episode, Surface, presses, task_of, textures
-from mvitac.control.servo_rows import Condition, Servo
-from mvitac.control.suite import Row
+from mvitac.control.find import find_suite
+from mvitac.control.servo import TASKS, Edge, Surface, presses, task_of, textures
+from mvitac.control.servo_rows import Condition, Episode, Servo
+from mvitac.control.suite import Row, rows_of, score
 from mvitac.system.files import digest
 
 RANDOM = "external:timm/test_resnet,weights=random,size=32,seed={}"
 KINDS = [kind for task in TASKS.values() for kind in task.kinds]
+
+
+def begin(kind: str, number: int, condition: str = "known sensor") -> Episode:
+    return find_suite("servo-v1").world(kind, condition, number)  # type: ignore[return-value]
 
 
 @pytest.fixture(scope="module")
@@ -49,17 +53,17 @@ def known(monkeypatch: pytest.MonkeyPatch, small: Servo) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_correction_changes_the_pose_by_itself(kind: str) -> None:
     task = task_of(kind)
-    start = Episode.begin(0, kind, 1)
+    start = begin(kind, 1)
     change = np.array([0.1, 2.0, -3.0])[: len(task.names)]
-    moved, still = (task.moved(start.shape, start.state, c) for c in (change, 0 * change))
+    moved, still = (task.moved(start.shape, start.states[-1], c) for c in (change, 0 * change))
     difference = task.pose(start.shape, moved) - task.pose(start.shape, still)
     assert np.allclose(difference, change, atol=[0.02, *[0.3] * (len(change) - 1)])
 
 
 def test_poses_mean_what_their_names_say() -> None:
-    straight = Episode.begin(0, "straight", 0).shape
+    straight = begin("straight", 0).shape
     assert np.allclose(Edge.pose(straight, np.array([7.0, 1.5, np.radians(-20)])), [1.5, 20])
-    wavy = Episode.begin(0, "surface", 0).shape
+    wavy = begin("surface", 0).shape
     at = Surface.state(wavy, np.array([0.4, 3.0, -2.0]), 12.0)
     assert np.allclose(Surface.pose(wavy, at), [0.4, 3.0, -2.0])
     step = np.array([1e-3, -1e-3])
@@ -73,33 +77,36 @@ def test_true_pose_stays_on_and_no_touch_does_not(kind: str) -> None:
     for known in (True, False):
         errors = []
         for number in range(8):
-            episode = Episode.begin(0, kind, number)
+            episode = begin(kind, number)
             for _ in range(60):
-                episode.move(-0.5 * (episode.pose - task.target) * known)
-            errors.append(episode.error()[0])
+                episode.step(-0.5 * (episode.pose - task.target) * known)
+            errors.append(episode.error[0])
         assert (np.mean(errors) < 0.15) == known
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_contact_is_lost_beyond_the_limit_and_stays_lost(kind: str) -> None:
     for part in (0.8, 1.3):
-        episode = Episode.begin(0, kind, 1)
+        episode = begin(kind, 1)
         limit = episode.task.limit
-        episode.move(episode.task.target + part * limit * (np.arange(len(limit)) == 0) - episode.pose)
-        there, mm, deg = episode.state, *episode.error()
+        episode.step(episode.task.target + part * limit * (np.arange(len(limit)) == 0) - episode.pose)
+        there, mm, deg = episode.states[-1], *episode.error
         assert episode.lost == (part > 1) and (mm == limit[0]) == (part > 1)
-        episode.move(episode.task.target - episode.pose)
-        assert (episode.state is there) == episode.lost == (part > 1)
-        assert not episode.lost or episode.error() == (mm, deg) == (limit[0], np.hypot.reduce(limit[1:]))
+        episode.step(episode.task.target - episode.pose)
+        assert (episode.states[-1] is there) == episode.lost == (part > 1)
+        assert not episode.lost or episode.error == (mm, deg) == (limit[0], np.hypot.reduce(limit[1:]))
 
 
 def test_pictures_show_the_pose_and_repeat() -> None:
-    one, other = Episode.begin(0, "straight", 2), Episode.begin(0, "straight", 2, new=True)
-    assert np.array_equal(one.touch(), one.touch())
-    assert other.copy.sensor.held_out and np.array_equal(one.state, other.state)
-    before = one.touch().astype(float)
-    one.move(np.array([1.0, 0.0]))
-    assert np.abs(one.touch() - before).mean() > 1
+    one, other, late = (begin("straight", 2, name) for name in ("known sensor", "new sensor", "50 ms"))
+    assert np.array_equal(one.look("touch"), one.look("touch"))
+    assert not np.array_equal(one.look("touch"), other.look("touch"))
+    assert np.array_equal(one.states[0], other.states[0])
+    before = one.look("touch")
+    one.step(np.array([1.0, 0.0]))
+    assert np.abs(one.look("touch").astype(float) - before).mean() > 1
+    late.step(np.array([1.0, 0.0]))
+    assert np.array_equal(late.look("touch"), before) and not np.array_equal(late.known, late.pose)
     assert not set(textures(True)) & set(textures(False)) and textures(False)
 
 
@@ -125,7 +132,8 @@ def test_a_result_repeats_and_says_how_good_each_row_is(
         result.run_suite([RANDOM.format(6)], small, tmp_path, About(name="five"))
     assert main(["bench", "check", str(done)]) == 0
     assert main(["bench", "board", str(done), "--out", str(tmp_path / "board.html")]) == 0
-    assert "true pose" in (tmp_path / "board.html").read_text()
+    text = (tmp_path / "board.html").read_text()
+    assert "true pose" in text and "data:image/webp;base64," in text
     assert f"{len(value['rows'])} rows hold" in capsys.readouterr().out
 
 
@@ -188,7 +196,7 @@ def first_look(suite: Servo, source: str, asked: float = 0.0) -> tuple[list[np.n
     def learn(images: dict[str, np.ndarray], poses: np.ndarray, num_val: int) -> Any:
         return lambda look: seen.append(look("touch")) or np.full(poses.shape[1], asked)
 
-    cells = suite.score(Row(source, 0, learn))
+    cells = score(suite, Row(source, 0, learn))
     return list(seen[0]), cells
 
 
@@ -198,16 +206,15 @@ def test_a_row_sees_its_own_episode_and_the_shuffled_one_the_next(small: Servo) 
     plain, cells = first_look(few, "", 1e3)
     shuffled, _ = first_look(few, "touch shuffled")
     for number in range(4):
-        options: dict[str, Any] = {"new": True, "noise": 3.0} if number > 1 else {}
-        episode = Episode.begin(0, "straight", number % 2, **options)
-        assert np.array_equal(plain[number], episode.touch())
+        episode = few.world("straight", "ab"[number // 2], number % 2)
+        assert np.array_equal(plain[number], episode.look("touch"))
         assert np.array_equal(plain[number], shuffled[number ^ 1])
-        before = episode.error()[0]
+        before = episode.error[0]
         assert abs(cells[number // 2]["mm"][number % 2] - before) < 1.5 * few.most * Edge.limit[0]  # it was bounded
 
 
 def test_rows(small: Servo) -> None:
-    rows = small.rows([open_model(RANDOM.format(seed)) for seed in (5, 6)])
+    rows = rows_of(small, [open_model(RANDOM.format(seed)) for seed in (5, 6)])
     own = [("", 5), ("", 6), ("pixels", None), ("untrained", 0), ("untrained", 1), ("imagenet", None)]
     rest = [("touch shuffled", 5), ("true pose", None), ("no touch", None), ("end to end", None)]
     assert [(row.source, row.seed) for row in rows if row.source != "imagenet"] == own[:-1] + rest
@@ -225,7 +232,7 @@ def test_the_suite_shows_what_was_measured() -> None:
         "surface": [133.27, 112.03],
     }
     for kind in KINDS:
-        seen = [Episode.begin(0, kind, 0, new=new).touch().mean() for new in (False, True)]
+        seen = [begin(kind, 0, name).look("touch").mean() for name in ("known sensor", "new sensor")]
         assert seen == pytest.approx(levels[kind], abs=0.05)
     images, poses = presses("edge", 0, 2, 0)
     assert images.mean() == pytest.approx(102.91, abs=0.05)
@@ -235,7 +242,7 @@ def test_the_suite_shows_what_was_measured() -> None:
 def test_latency_hurts(small: Servo) -> None:
     long = replace(small, steps=40, settle=10, shapes=6, conditions=(Condition(name="a"),))
     late = replace(long, conditions=(Condition(name="a", latency_ms=150),))
-    mm = [np.mean(each.score(Row("true pose", None, None))[2]["mm"]) for each in (long, late)]
+    mm = [np.mean(score(each, Row("true pose", None, None))[2]["mm"]) for each in (long, late)]
     assert mm[1] > 1.5 * mm[0]
 
 
@@ -245,11 +252,11 @@ def test_gymnasium_environment() -> None:
 
     import mvitac.control.env
 
-    env = gymnasium.make("mvitac/Servo-v1", kind="curved").unwrapped
+    env = gymnasium.make("mvitac/Servo-v1", task="curved", condition="100 ms").unwrapped
     check_env(env, skip_render_check=True)
-    env.reset(seed=1)
-    for _ in range(60):
-        pose = env.episode.pose  # a policy that cheats
-        *_, lost, over, info = env.step((-0.5 * pose / (0.2 * Edge.limit)).astype(np.float32))
-    assert over and not lost and info["mm"] < 0.2
-    assert mvitac.control.env.ServoEnv
+    _, info = env.reset(seed=1)
+    over = False
+    while not over:  # a policy that cheats
+        seen, reward, over, _, info = env.step((-0.5 * info["known"] / (0.2 * Edge.limit)).astype(np.float32))
+    assert info["mm"] < 0.5 and -0.5 < reward < 0
+    assert np.array_equal(seen["touch"], env.render()) and mvitac.control.env.LoopEnv

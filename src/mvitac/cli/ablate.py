@@ -6,30 +6,47 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, parse, printed_to, save_json
+from mvitac.control.ablate import PLAUSIBLE, open_policy, read_episodes, report, suite_episodes, suite_policy
 from mvitac.control.ablate import ablate as compare
-from mvitac.control.ablate import open_policy, read_episodes, report
+from mvitac.control.find import find_suite, shipped
+from mvitac.control.video import film, write_film
 from mvitac.data.pack import Pack
 from mvitac.system.progress import shown
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Options:
-    """Does a policy use touch? Replace what it feels and sees in recorded episodes, and compare what it does."""
+    """Does a policy use touch? Replace what it feels and sees in episodes, and compare what it does."""
 
     policy: Positional[str]
-    """module:function or FILE.py:function of an observation, or the folder of a LeRobot policy."""
+    """module:function or FILE.py:function of an observation, or the folder of a LeRobot policy. In episodes of a suite
+    also an encoder, or "pixels": it learns the task as the suite's rows do."""
     data: Path
-    """Folder of a pack: its groups are the episodes, and its values "action" what was demonstrated."""
+    """Folder of a pack: its groups are the episodes, and its values "action" what was demonstrated. Or a suite, a task and
+    a condition for a closed loop: "insert-v1/both/30", "servo-v1/corner/known sensor"."""
+    out: Path | None = None
+    """Of a suite, also write a film of its first episode, with and without its own touch: .webp or .gif, else a still."""
     json: Path | None = None
     """Also write everything that is printed to this file; - = stdout, and the tables to stderr."""
 
 
 def ablate(argv: list[str]) -> None:
-    """mvitac ablate POLICY --data EPISODES [--json FILE]"""
+    """mvitac ablate POLICY --data EPISODES [--out FILM] [--json FILE]"""
     options = parse(_Options, argv, "ablate")
     check_json(options.json)
-    policy, episodes = open_policy(options.policy), read_episodes(Pack(options.data))
+    name, *cell = options.data.parts
+    if name in shipped():
+        suite, cell = find_suite(name), tuple(cell)
+        episodes = suite_episodes(suite, cell)
+        policy = suite_policy(suite, cell, options.policy)
+    elif options.out:
+        raise ValueError(f"--out is a film of a suite, and --data {options.data} is none: leave it out")
+    else:
+        policy, episodes = open_policy(options.policy), read_episodes(Pack(options.data))
     with shown():
         result = compare(policy, episodes)
+    if options.out:
+        runs = [("as it is", policy, ""), ("touch of another episode", policy, PLAUSIBLE[0])]
+        write_film(options.out, film(episodes, runs))
     print(report(result), file=printed_to(options.json))
     save_json(options.json, result, sealed=True)

@@ -1,27 +1,35 @@
-"""Does a policy use touch? Replace what it feels (or sees) in recorded episodes, and compare what it does.
+"""Does a policy use touch? Replace what it feels (or sees), and compare what it does, and how well.
 
-A policy is a function of an observation, called for each frame of an episode in order:
+A policy is a function of an observation, called for each step of an episode in order:
 
     {"touch": uint8 [H, W, C], "vision": uint8 [H, W, 3], "step": 17, "state": float [S]} -> action [T]
 
-"state" is every task of values of the pack except "action", by its own name. A policy with memory has ``reset()``, which
-is called before each episode; one that draws at random seeds itself there, or its own noise counts as change. Changes and
-errors are in standard deviations of the demonstrated action, the mean over its components; one that never changes is 0.
+"state" is every task of values of a pack except "action", by its own name. A policy with memory has ``reset()``, which is
+called before each episode; one that draws at random seeds itself there, or its own noise counts as change.
+
+Changes are in standard deviations of the action, the mean over its components; one that never changes is 0. The error in
+recorded episodes is the distance to the demonstrated action, in the same unit; in those of a suite what an episode lost.
 """
 
 import importlib
 import runpy
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tabulate import tabulate
 
+from mvitac.control.learn import encoding, pixels, ridge
+from mvitac.control.suite import OWN
 from mvitac.data.pack import Pack
 from mvitac.data.windows import places
+from mvitac.deploy.artifact import load
 from mvitac.evaluation.intervals import mean_interval
+from mvitac.registry import unknown
 from mvitac.system.progress import work
 
 Policy = Callable[[dict[str, Any]], Any]
@@ -29,30 +37,43 @@ LAG = 10
 PLAUSIBLE = ("another episode", f"{LAG} frames ago")  # what a policy may have met: others may just surprise it
 KINDS = ("mean frame", *PLAUSIBLE, "noise")
 SMALL = 0.02  # standard deviations of the action; below this a policy does not react
+FRAMES = 200  # that the mean frame and the strength of noise are of
 
 
-@dataclass(frozen=True)
+@dataclass
 class Episodes:
-    """Recorded episodes of a pack: rows in order, demonstrated actions [N, T], and what else a policy may read."""
+    """Episodes to act in: each is begun as a world (``control.suite``)."""
 
-    pack: Pack
-    rows: list[np.ndarray]
-    actions: np.ndarray
-    more: dict[str, np.ndarray]
+    begin: Sequence[Callable[[], Any]]
+    senses: tuple[str, ...]
+    images: dict[str, Any] = field(default_factory=dict)  # by sense: all that is seen without replacement, and
+    rows: Sequence[np.ndarray] = ()  # those of each episode; of a suite, ``ablate`` fills both in
+    actions: np.ndarray | None = None  # demonstrated, [N, T], episode after episode
+    touched: np.ndarray | None = None  # bool [N]
+    lost: Callable[[Any], float] = lambda world: 0.0
+    unit: str = "standard deviations of the action"  # of the error
+
+
+class Recorded:
+    """An episode of a pack as a world: what a policy does changes nothing."""
+
+    def __init__(self, pack: Pack, rows: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
+        self.pack, self.rows, self.all, self.steps = pack, rows, values, 0
+        self.senses = pack.spec.modalities[::-1]  # touch first
 
     @property
-    def senses(self) -> tuple[str, ...]:
-        return self.pack.spec.modalities[::-1]  # touch first
+    def values(self) -> dict[str, np.ndarray]:
+        return {key: values[self.rows[self.steps]] for key, values in self.all.items()}
 
-    def touched(self) -> np.ndarray:
-        """bool [N]: column "contact" if there is one, else whether touch differs from the episode's first frame."""
-        if "contact" in self.pack.table.column_names:
-            return np.isin(self.pack.column("contact").astype(str), ("True", "true", "1", "1.0"))
-        found = np.zeros(self.pack.num, bool)
-        for rows in self.rows:
-            images = self.pack.images["touch"][rows].astype(np.float32)
-            found[rows] = np.abs(images - images[0]).mean((1, 2, 3)) > 3.0  # levels; noise of a sensor is 1 to 2
-        return found
+    @property
+    def over(self) -> bool:
+        return self.steps == len(self.rows)
+
+    def look(self, sense: str) -> np.ndarray:
+        return self.pack.images[sense][self.rows[self.steps]]
+
+    def step(self, action: np.ndarray) -> None:
+        self.steps += 1
 
 
 def read_episodes(pack: Pack) -> Episodes:
@@ -67,7 +88,37 @@ def read_episodes(pack: Pack) -> Episodes:
     rows = np.split(by, np.cumsum(np.bincount(which))[:-1])
     if len(rows) < 2:
         raise ValueError(f"{pack.path} has one episode: episodes are its groups, give at least two")
-    return Episodes(pack, rows, values.pop("action"), values)
+    actions = values.pop("action")[by]
+    begin = [partial(Recorded, pack, each, values) for each in rows]
+    return Episodes(begin, begin[0]().senses, pack.images, rows, actions, _touched(pack, rows))
+
+
+def _touched(pack: Pack, rows: Sequence[np.ndarray]) -> np.ndarray:
+    """bool [N]: column "contact" if there is one, else whether touch differs from the episode's first frame."""
+    if "contact" in pack.table.column_names:
+        return np.isin(pack.column("contact").astype(str), ("True", "true", "1", "1.0"))[np.concatenate(rows)]
+    found = []
+    for each in rows:
+        images = pack.images["touch"][each].astype(np.float32)
+        found.append(np.abs(images - images[0]).mean((1, 2, 3)) > 3.0)  # levels; noise of a sensor is 1 to 2
+    return np.concatenate(found)
+
+
+def suite_episodes(suite: Any, cell: tuple[str, ...]) -> Episodes:
+    """The episodes of a suite of one task and condition."""
+    if cell not in suite.cells(OWN):
+        raise unknown(f"task and condition of {suite.name}", "/".join(cell), map("/".join, suite.cells(OWN)))
+    begin = [partial(suite.world, *cell, number) for number in range(suite.num)]
+    return Episodes(begin, begin[0]().senses, lost=lambda world: suite.lost(world.result()), unit=suite.failure)
+
+
+def suite_policy(suite: Any, cell: tuple[str, ...], text: str) -> Policy:
+    """A policy that ``open_policy`` takes; or that of an encoder, or of "pixels", which learns as rows of the suite do."""
+    if (Path(text) / "config.json").is_file() or (":" in text and not text.startswith("external:")):
+        return open_policy(text)
+    learn = ridge(pixels if text == "pixels" else encoding(load(text)))
+    estimate, world = learn(*suite.taught(suite.lesson(cell))), suite.world(*cell, 0)
+    return lambda given: world.answer(estimate(lambda sense: given[sense][None])[0])
 
 
 def open_policy(text: str) -> Policy:
@@ -115,79 +166,115 @@ def lerobot_policy(folder: Path) -> Policy:
     return act
 
 
-def act(policy: Policy, episodes: Episodes, sense: str = "", kind: str = "") -> np.ndarray:
-    """Actions [N, T] of ``policy`` in every row, with ``sense`` replaced by ``kind`` of ``KINDS``."""
-    found, images = np.zeros(episodes.actions.shape), episodes.pack.images
-    mean, spread = _moments(images[sense], episodes.rows) if kind in ("mean frame", "noise") else (np.zeros(0),) * 2
-    for number, rows in enumerate(episodes.rows):
+def nothing(world: Any, given: dict[str, Any]) -> None:
+    pass
+
+
+def act(
+    policy: Policy | None,
+    episodes: Episodes,
+    sense: str = "",
+    kind: str = "",
+    watch: Callable[[Any, dict[str, Any]], None] = nothing,
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Actions [N, T] of every step with ``sense`` replaced by ``kind``, what its episode lost [N], steps of each episode.
+
+    Without a policy, of one that knows the truth. ``watch`` is called in each step, before the action.
+    """
+    replaced = replacement(kind, episodes.images[sense], episodes.rows) if kind else None
+    actions, lost, lengths = [], [], []
+    for number, begin in enumerate(episodes.begin):
         getattr(policy, "reset", lambda: None)()
-        other = episodes.rows[(number + 1) % len(episodes.rows)]
-        rng = np.random.default_rng([0xAB1A7E, number])
-        for step, row in enumerate(rows):
-            observation: dict[str, Any] = {key: values[row] for key, values in episodes.more.items()}
-            observation |= {"step": step, **{each: images[each][row] for each in episodes.senses}}
-            if kind == "mean frame":
-                observation[sense] = (mean + 0.5).astype(np.uint8)
-            elif kind == "another episode":
-                observation[sense] = images[sense][other[min(step, len(other) - 1)]]
-            elif kind == "noise":
-                levels = mean.mean((0, 1)) + spread * rng.standard_normal(mean.shape)
-                observation[sense] = np.clip(levels, 0, 255).astype(np.uint8)
-            elif kind:
-                observation[sense] = images[sense][rows[max(0, step - LAG)]]
-            action = np.asarray(policy(observation), float).ravel()
-            if action.shape != found[row].shape:
-                raise ValueError(f"the policy gives {len(action)} numbers, episodes have actions of {len(found[row])}")
-            found[row] = action
-    return found
+        world, seen, step = begin(), deque(maxlen=LAG + 1), 0
+        while not world.over:
+            given = {**getattr(world, "values", {}), "step": step, **{each: world.look(each) for each in world.senses}}
+            if replaced:
+                seen.append(given[sense])
+                given[sense] = replaced(number, step, seen[0])
+            watch(world, given)
+            action = np.asarray(policy(given) if policy else world.answer(world.known), float).ravel()
+            width = len(world.most) if episodes.actions is None else episodes.actions.shape[1]
+            if len(action) != width:
+                raise ValueError(f"the policy gives {len(action)} numbers, episodes have actions of {width}")
+            actions.append(action)
+            world.step(action)
+            step += 1
+        lost += [episodes.lost(world)] * step
+        lengths.append(step)
+    return np.stack(actions), np.array(lost), np.split(np.arange(len(lost)), np.cumsum(lengths)[:-1])
 
 
-def _moments(images: Any, episodes: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """The mean frame [H, W, C], and the standard deviation [C] of all pixels, read episode by episode."""
-    num, total, square = 0, np.zeros(images.shape[1:]), np.zeros(images.shape[-1])
-    for rows in episodes:
-        part = np.asarray(images[rows], np.float64)
-        num, total, square = num + len(rows), total + part.sum(0), square + (part**2).mean((1, 2)).sum(0)
-    mean = total / num
-    return mean, np.sqrt(square / num - mean.mean((0, 1)) ** 2)
+def replacement(kind: str, images: Any, rows: Sequence[np.ndarray]) -> Callable[[int, int, np.ndarray], np.ndarray]:
+    """What replaces an image: a function of the episode's number, its step, and the image of ``LAG`` steps ago."""
+    every = np.concatenate(rows)
+    some = np.asarray(images[np.sort(every[:: -(-len(every) // FRAMES)])], np.float32)
+    mean, spread = some.mean(0), some.std((0, 1, 2))
+
+    def give(number: int, step: int, ago: np.ndarray) -> np.ndarray:
+        if kind == "mean frame":
+            return (mean + 0.5).astype(np.uint8)
+        if kind == "another episode":
+            other = rows[(number + 1) % len(rows)]
+            return images[other[min(step, len(other) - 1)]]
+        if kind == "noise":
+            drawn = np.random.default_rng([0xAB1A7E, number, step]).standard_normal(mean.shape)
+            return np.clip(mean.mean((0, 1)) + spread * drawn, 0, 255).astype(np.uint8)
+        return ago
+
+    return give
 
 
 def ablate(policy: Policy, episodes: Episodes) -> dict[str, Any]:
     """What changes with each replacement of each sense, JSON-ready: {"error", "rows": [...], "verdicts": {sense: ...}}."""
-    wanted = episodes.actions
-    still = np.nanmax(wanted, axis=0) == np.nanmin(wanted, axis=0)
-    scale = np.where(still, np.inf, np.nanstd(wanted, axis=0))
-    kept = [rows[np.isfinite(wanted[rows]).all(1)] for rows in episodes.rows]
-    parts, rows = _parts(episodes, kept), []
+    seen: dict[str, list[np.ndarray]] = {sense: [] for sense in episodes.senses}
+
+    def keep(world: Any, given: dict[str, Any]) -> None:
+        for sense in seen:
+            seen[sense].append(given[sense])
+
+    rows: list[dict[str, Any]] = []
     with work("acting", 1 + len(episodes.senses) * len(KINDS), "times") as advance:
-        normal = act(policy, episodes)
+        normal, own, steps = act(policy, episodes, watch=nothing if episodes.images else keep)
         advance()
-        own = (np.abs(normal - wanted) / scale).mean(1)
+        if not episodes.images:
+            episodes.images, episodes.rows = {sense: np.stack(images) for sense, images in seen.items()}, steps
+        wanted = normal if episodes.actions is None else episodes.actions
+        still = np.nanmax(wanted, axis=0) == np.nanmin(wanted, axis=0)
+        scale = np.where(still, np.inf, np.nanstd(wanted, axis=0))
+        kept = [each[np.isfinite(wanted[each]).all(1)] for each in steps]
+        parts = _parts(episodes.touched, kept)
+        if episodes.actions is not None:
+            own = away(normal, wanted, scale)
         for sense, kind in ((sense, kind) for sense in episodes.senses for kind in KINDS):
-            changed = act(policy, episodes, sense, kind)
+            changed, lost, _ = act(policy, episodes, sense, kind)
             advance()
-            change = (np.abs(changed - normal) / scale).mean(1)
-            worse = (np.abs(changed - wanted) / scale).mean(1) - own
+            worse = (lost if episodes.actions is None else away(changed, wanted, scale)) - own
             of = {part: _paired(worse, each) for part, each in parts.items()}
-            paired = {"change": _paired(change, kept), "error": _paired(worse, kept), "parts": of}
+            paired = {"change": _paired(away(changed, normal, scale), kept), "error": _paired(worse, kept), "parts": of}
             rows.append({"sense": sense, "kind": kind, **paired})
     found = {sense: verdict(sense, [row for row in rows if row["sense"] == sense]) for sense in episodes.senses}
-    return {"episodes": len(kept), "error": _paired(own, kept)[:3], "rows": rows, "verdicts": found}
+    about = {"episodes": len(kept), "unit": episodes.unit, "error": _paired(own, kept)[:3]}
+    return {**about, "rows": rows, "verdicts": found}
 
 
-def _parts(episodes: Episodes, kept: Sequence[np.ndarray]) -> dict[str, list[np.ndarray]]:
-    """Parts of the episodes -> their rows: thirds of the time, and with and without contact."""
-    touched = episodes.touched()
-    thirds = [np.array_split(rows, 3) for rows in kept]
+def away(actions: np.ndarray, others: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    return (np.abs(actions - others) / scale).mean(1)
+
+
+def _parts(touched: np.ndarray | None, kept: Sequence[np.ndarray]) -> dict[str, list[np.ndarray]]:
+    """Parts of recorded episodes -> their steps: thirds of the time, and with and without contact."""
+    if touched is None:
+        return {}
+    thirds = [np.array_split(steps, 3) for steps in kept]
     found = {name: [third[i] for third in thirds] for i, name in enumerate(("first third", "second", "last"))}
-    found["in contact"] = [rows[touched[rows]] for rows in kept]
-    found["no contact"] = [rows[~touched[rows]] for rows in kept]
+    found["in contact"] = [steps[touched[steps]] for steps in kept]
+    found["no contact"] = [steps[~touched[steps]] for steps in kept]
     return {name: parts for name, parts in found.items() if sum(map(bool, map(len, parts))) > 1}
 
 
 def _paired(values: np.ndarray, episodes: Sequence[np.ndarray]) -> list[float]:
     """Mean over episodes, ends of the 95 % interval, p."""
-    return list(mean_interval(np.array([[values[rows].mean() for rows in episodes if len(rows)]])))
+    return list(mean_interval(np.array([[values[steps].mean() for steps in episodes if len(steps)]])))
 
 
 def verdict(sense: str, rows: Sequence[Mapping[str, Any]]) -> str:
@@ -211,5 +298,5 @@ def report(result: Mapping[str, Any]) -> str:
         parts = [f"{value[0]:+.2f}" for value in row["parts"].values()]
         lines.append([row["sense"], row["kind"], change, worse, f"{row['error'][3]:.2g}", *parts])
     error = "{:.2f} [{:.2f}, {:.2f}]".format(*result["error"])
-    about = f"{result['episodes']} episodes, error {error}, in standard deviations of the action"
+    about = f"{result['episodes']} episodes, error {error}, in {result['unit']}"
     return "\n".join([about, tabulate(lines, head), *result["verdicts"].values()])

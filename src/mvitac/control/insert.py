@@ -10,15 +10,20 @@ a shroud hides the peg from it.
 Units: metres and radians inside, mm and degrees in names and results.
 """
 
+import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
+from functools import cached_property, lru_cache
+from typing import Any, ClassVar, Literal
 
 import mujoco
 import numpy as np
 
+from mvitac.control.learn import Lesson
 from mvitac.control.servo import FIELD_MM, SIZE, Copy, Shape, draw_copy, draw_shape, textured, textures
+from mvitac.control.suite import SHUFFLED, TUNED, Cell, LoopSuite
+from mvitac.evaluation.intervals import interval
 from mvitac.sim.coordinates import grid
 
 LENGTH_M, DEPTH_M, CLEAR_M = 0.024, 0.010, 0.0012  # of the peg below the hand; of the insertion; beside the peg
@@ -26,6 +31,7 @@ ABOVE_M, ALIGN, DOWN, SUBSTEPS = 0.016, 9, 9, 40  # height at the start; steps a
 DEPTH_MM = 0.8  # of the peg in the gel
 REACH = {"slot_mm": 7.0, "offset_mm": 2.5, "turn_deg": 9.0}
 GAIN, MOST = 0.6, np.array([5.0, 6.0])  # part of the way, and largest change of x (mm) and turn (degrees), in one step
+SENSES = {"vision": ("vision",), "touch": ("touch",), "both": ("vision", "touch")}
 _TAG, _VIEW = 0x1A5E27, 0x1A5E28
 
 
@@ -57,11 +63,15 @@ def draw_peg(seed: int, number: int, trained: bool) -> tuple[Peg, float]:
 
 
 class Insertion:
-    """One episode: ``see`` and ``touch`` are all that a policy gets; ``step`` moves the hand."""
+    """One episode. An action is the set point of x (mm) and turn (degrees), towards which the hand moves in its plan."""
 
-    def __init__(self, seed: int, number: int, *, trained: bool = False) -> None:
-        self.key = (seed, int(trained), number)
-        self.peg, self.slot_mm = draw_peg(seed, number, trained)
+    most = np.array([20.0, 30.0])
+
+    def __init__(
+        self, suite: "Insert", number: int, *, trained: bool = False, senses: tuple[str, ...] = SENSES["both"]
+    ) -> None:
+        self.suite, self.senses, self.key = suite, senses, (suite.seed, int(trained), number)
+        self.peg, self.slot_mm = draw_peg(suite.seed, number, trained)
         self.model = mujoco.MjModel.from_xml_string(_scene(self.peg, self.slot_mm))
         self.data = mujoco.MjData(self.model)
         self.x_mm = self.turn_deg = 0.0
@@ -69,8 +79,8 @@ class Insertion:
         self._go()
 
     @property
-    def wanted(self) -> np.ndarray:
-        """The set point x (mm) and turn (degrees) with which the peg is upright above the slot: what the expert knows."""
+    def known(self) -> np.ndarray:
+        """The set point with which the peg is upright above the slot."""
         turn = -self.peg.turn_deg
         return np.array([self.slot_mm - self.peg.offset_mm * math.cos(math.radians(turn)), turn])
 
@@ -78,26 +88,35 @@ class Insertion:
     def over(self) -> bool:
         return self.steps == ALIGN + DOWN
 
+    @property
+    def error(self) -> tuple[float, float]:
+        """How far the peg is from the slot's axis, in mm at its tip and in degrees."""
+        tip, up = self.data.site_xpos[0], self.data.site_xmat[0].reshape(3, 3)[:, 2]
+        return abs(1000 * float(tip[0]) - self.slot_mm), abs(math.degrees(math.atan2(float(up[0]), float(up[2]))))
+
+    @property
+    def reward(self) -> float:
+        return self.over * self.result()[0]
+
+    def look(self, sense: str) -> np.ndarray:
+        if sense == "touch":
+            return touch_of(self.key).copy()
+        mujoco.mj_kinematics(self.model, self.data)  # of where the last step ended
+        return _photograph(self.model, self.data, (*self.key, self.steps))
+
+    def answer(self, estimate: np.ndarray) -> np.ndarray:
+        return estimate
+
     def step(self, action: np.ndarray) -> None:
-        """Move towards the set point ``action``, x (mm) and turn (degrees), and go on with the plan."""
         own = np.array([self.x_mm, self.turn_deg])
         self.x_mm, self.turn_deg = own + np.clip(GAIN * (action - own), -MOST, MOST)
         self.steps += 1
         self._go()
 
-    def touch(self) -> np.ndarray:
-        return touch_of(self.key)
-
-    def see(self) -> np.ndarray:
-        """The camera's picture, uint8 [64, 64, 3]."""
-        mujoco.mj_kinematics(self.model, self.data)  # of where the last step ended
-        return _photograph(self.model, self.data, (*self.key, self.steps))
-
-    def result(self, most_mm: float, most_deg: float, depth: float) -> tuple[bool, float, float]:
-        """Success, and how far the peg is from the slot's axis, in mm at its tip and in degrees."""
-        tip, up = self.data.site_xpos[0], self.data.site_xmat[0].reshape(3, 3)[:, 2]
-        mm, deg = abs(1000 * float(tip[0]) - self.slot_mm), abs(math.degrees(math.atan2(float(up[0]), float(up[2]))))
-        return bool(mm <= most_mm and deg <= most_deg and tip[2] < -depth * DEPTH_M), float(mm), float(deg)
+    def result(self) -> tuple[float, float, float]:
+        (mm, deg), suite = self.error, self.suite
+        deep = self.data.site_xpos[0, 2] < -suite.success_depth * DEPTH_M
+        return float(mm <= suite.success_mm and deg <= suite.success_deg and deep), mm, deg
 
     def _height(self) -> float:
         down = max(0, self.steps - ALIGN) / DOWN
@@ -178,3 +197,85 @@ def _photograph(model: Any, data: Any, key: tuple[int, ...]) -> np.ndarray:
     noise = np.random.default_rng([_VIEW, *key]).normal(0, 2.0, (count, 3))
     levels = 255 * np.clip(colours * light[:, None], 0, 1) ** (1 / 2.2) + noise
     return np.clip(levels, 0, 255).astype(np.uint8).reshape(SIZE, SIZE, 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Insert(LoopSuite):
+    """The suite ``insert-v1``: behaviour cloning of an expert, by vision, touch or both, from few or many demonstrations."""
+
+    sums: ClassVar[tuple[str, ...]] = ("success", "mm", "deg")  # of one episode
+    kinds: ClassVar[list[str]] = list(SENSES)
+    true: ClassVar[str] = "expert"
+    blind: ClassVar[str] = "no senses"
+    other: ClassVar[int] = -1
+    failure: ClassVar[str] = "failures"
+    scored: ClassVar[int] = 1
+    note: ClassVar[str] = (
+        "Share of insertions that succeed with the 95 % interval over episodes (and seeds), and the error at the end"
+    )
+
+    kind: Literal["insert"]
+    episodes: int
+    demonstrations: tuple[int, ...]
+    noise: float
+    success_mm: float
+    success_deg: float
+    success_depth: float
+
+    @property
+    def num(self) -> int:
+        return self.episodes
+
+    @cached_property
+    def recorded(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Images and the expert's set points of every step, demonstration after demonstration, for all rows.
+
+        Above the slot the hand goes elsewhere than the expert says, so that its own place in the picture tells nothing.
+        """
+        seen, felt, actions = [], [], []
+        for number in range(max(self.demonstrations)):
+            world = Insertion(self, number, trained=True)
+            rng = np.random.default_rng([self.seed, 0xDE40, number])
+            while not world.over:
+                seen.append(world.look("vision"))
+                felt.append(world.look("touch"))
+                actions.append(world.known)
+                world.step(world.known + self.noise * rng.standard_normal(2) * (world.steps < ALIGN))
+        return {"vision": np.stack(seen), "touch": np.stack(felt)}, np.stack(actions)
+
+    def data(self) -> dict[str, str]:
+        """Digests of the demonstrations."""
+        return {name: hashlib.sha256(images.tobytes()).hexdigest() for name, images in self.recorded[0].items()}
+
+    def cells(self, source: str) -> list[Cell]:
+        """The senses and numbers of demonstrations that a row has."""
+        both = ("both",)
+        only = {self.true: both, self.blind: both, TUNED: both, SHUFFLED: ("touch", *both)}.get(source, tuple(SENSES))
+        return [(senses, f"{num}") for senses in only for num in self.demonstrations]
+
+    def world(self, task: str, condition: str, number: int) -> Insertion:
+        return Insertion(self, number, senses=SENSES[task])
+
+    def lesson(self, cell: Cell) -> Cell:
+        return cell
+
+    def taught(self, lesson: Cell) -> Lesson:
+        (images, actions), num = self.recorded, int(lesson[1])
+        given, steps = {sense: images[sense] for sense in SENSES[lesson[0]]}, ALIGN + DOWN
+        return given, actions[: num * steps], max(2, num // 5) * steps
+
+    def lost(self, result: Sequence[float]) -> float:
+        return 1 - result[0]
+
+    def impossible(self, task: str, n: np.ndarray, sums: np.ndarray) -> bool:
+        """Whether no episodes give these sums [3, episodes]: success needs a small error."""
+        success, mm, deg = sums
+        fits = n.shape == mm.shape == (self.episodes,) and (n == 1).all() and np.isin(success, (0, 1)).all()
+        small = (mm <= self.success_mm) & (deg <= self.success_deg)
+        return not (fits and (sums >= 0).all() and (small | (success == 0)).all())
+
+    def text(self, cells: Sequence[dict[str, Any]]) -> str:
+        """A cell of a table, of those of all seeds."""
+        mean, low, high = (100 * value for value in interval([self.record(cell) for cell in cells]))
+        mm, deg = (np.mean([cell[key] for cell in cells]) for key in self.sums[1:])
+        return f"{mean:.0f} [{low:.0f}, {high:.0f}] %, {mm:.1f} mm, {deg:.1f}°"

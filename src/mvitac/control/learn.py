@@ -2,21 +2,21 @@
 
 import copy
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mvitac.bench.external import open_model
 from mvitac.evaluation.regressors import fit_ridge
 from mvitac.model import Model
+from mvitac.nn.encoders import num_features
 from mvitac.sim.gel import area_resize
 
 Encode = Callable[[str, np.ndarray], np.ndarray]  # modality, images uint8 [N, S, S, 3] -> features [N, D]
 Look = Callable[[str], np.ndarray]  # modality -> what all episodes show now, uint8 [E, S, S, 3]
 Estimate = Callable[[Look], np.ndarray]  # -> [E, T] or [T]
 Learn = Callable[[dict[str, np.ndarray], np.ndarray, int], Estimate]
+Lesson = tuple[dict[str, np.ndarray], np.ndarray, int]
 """Images by modality, targets [N, T] of the first N of them, how many of the last of these choose a strength."""
 
 
@@ -58,43 +58,39 @@ def blind(images: dict[str, np.ndarray], targets: np.ndarray, num_val: int) -> E
     return lambda look: targets.mean(0)
 
 
-class _Network(nn.Module):
-    """A copy of a trunk for each image of a row, and one linear head on their features."""
-
-    def __init__(self, text: str, images: int, num: int) -> None:
-        super().__init__()
-        trunk: Any = open_model(text).encoders["touch"]
-        self.trunks = nn.ModuleList(copy.deepcopy(trunk) for _ in range(images))
-        for each in self.trunks:
-            each.network.requires_grad_(True)  # type: ignore[union-attr]
-        self.head = nn.Linear(images * trunk.num_features, num)
-
-    def forward(self, images: Sequence[Tensor]) -> Tensor:
-        return self.head(torch.cat([trunk(x) for trunk, x in zip(self.trunks, images, strict=True)], 1))
-
-
-def end_to_end(text: str, steps: int) -> Learn:
-    """Train the network that ``text`` names with a linear head, by smooth L1 on standardised targets."""
+def trained(model: Model, steps: int, rate: float) -> Learn:
+    """Train a copy of ``model`` for each sense and one linear head, by smooth L1 on standardised targets."""
 
     def tensors(images: Sequence[np.ndarray]) -> list[Tensor]:
         return [torch.from_numpy(x).permute(0, 3, 1, 2) for x in images]
 
     def learn(images: dict[str, np.ndarray], targets: np.ndarray, num_val: int) -> Estimate:
         mean, std = targets.mean(0), targets.std(0) + 1e-9
+        trunks = nn.ModuleDict({sense: copy.deepcopy(model) for sense in images}).train()
+        x, y = tensors(list(images.values())), torch.from_numpy((targets - mean) / std).float()
+
+        def features(given: Sequence[Tensor]) -> Tensor:
+            return torch.cat([trunk(**{m: each})[m] for (m, trunk), each in zip(trunks.items(), given, strict=True)], 1)
+
         with torch.random.fork_rng():
             torch.manual_seed(0)
-            network = _Network(text, len(images), targets.shape[1]).train()
-            x, y = tensors(list(images.values())), torch.from_numpy((targets - mean) / std).float()
-            optimiser = torch.optim.AdamW([p for p in network.parameters() if p.requires_grad], weight_decay=0.05)
-            schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=steps)
+            head = nn.Linear(sum(num_features(model.encoders[m]) for m in images), targets.shape[1])
+            learned = [p.requires_grad_() for p in (*trunks.parameters(), *head.parameters()) if p.is_floating_point()]
+            optimiser = torch.optim.AdamW(learned, weight_decay=0.05)
+            schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=steps)
             for _ in range(steps):
                 rows = torch.randint(len(y), (64,))
-                loss = nn.functional.smooth_l1_loss(network([each[rows] for each in x]), y[rows])
+                loss = nn.functional.smooth_l1_loss(head(features([each[rows] for each in x])), y[rows])
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()
                 schedule.step()
-        network.eval().requires_grad_(False)
-        return lambda look: network(tensors([look(each) for each in images])).numpy() * std + mean
+        trunks.eval()
+
+        @torch.no_grad()
+        def estimate(look: Look) -> np.ndarray:
+            return head(features(tensors([look(each) for each in images]))).numpy() * std + mean
+
+        return estimate
 
     return learn

@@ -6,7 +6,6 @@
 The row that needs no picture, of the true pose or the expert, is computed again when a result is checked.
 """
 
-import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,34 +16,20 @@ from tabulate import tabulate
 from mvitac.bench.encoder import About, measure
 from mvitac.bench.result import problems_of, read_signed
 from mvitac.bench.score import kept_part
-from mvitac.control.insert_rows import Insert
-from mvitac.control.servo_rows import Servo
-from mvitac.control.suite import OWN, SHUFFLED, Row
+from mvitac.control.ablate import suite_episodes
+from mvitac.control.find import Suite, find_suite, shipped
+from mvitac.control.suite import OWN, SHUFFLED, TUNED, Row, rows_of, score
+from mvitac.control.video import encoded, film
 from mvitac.evaluation.intervals import paired_difference
 from mvitac.model import Model
-from mvitac.registry import from_json, unknown
 from mvitac.report.html import blocks as page
+from mvitac.report.html import data_uri
 from mvitac.system.files import digest, fields_of, read_json, write_atomic
 from mvitac.system.progress import work
 from mvitac.system.provenance import provenance
 
 FORM = "mvitac-control", 1
-SUITES = Path(__file__).parent / "suites"
-Suite = Servo | Insert
 Scored = dict[str, dict[tuple[str, str], list[dict[str, Any]]]]  # source -> task, condition -> cells of its seeds
-
-
-def shipped() -> list[str]:
-    """Names of the closed-loop suites of this version."""
-    return sorted(path.stem for path in SUITES.glob("*.toml"))
-
-
-def find_suite(name: str) -> Suite:
-    """The suite ``name`` of this version."""
-    if name not in shipped():
-        raise unknown("suite", name, shipped())
-    value = tomllib.loads((SUITES / f"{name}.toml").read_text())
-    return from_json(Insert if value["kind"] == "insert" else Servo, value, "suite")
 
 
 def run_suite(places: Sequence[str], suite: Suite, out: Path, about: About) -> Path:
@@ -53,20 +38,20 @@ def run_suite(places: Sequence[str], suite: Suite, out: Path, about: About) -> P
     The same call continues an interrupted one. Rows of controls, the same for every encoder, are kept in <out>/parts.
     """
 
-    def score(models: Sequence[Model], encoder: dict[str, Any]) -> dict[str, Any]:
-        here, asked, rows = provenance(), suite.rows(models), []
+    def measured(models: Sequence[Model], encoder: dict[str, Any]) -> dict[str, Any]:
+        here, asked, rows = provenance(), rows_of(suite, models), []
         for problem in problems_of(encoder, [row.source for row in asked]):
             raise ValueError(problem)
         with work(f"{encoder['name']} on {suite.name}", len(asked), "rows") as advance:
             for row in asked:
-                key = digest(encoder) if row.source in (OWN, SHUFFLED) else "controls"
+                key = digest(encoder) if row.source in (OWN, TUNED, SHUFFLED) else "controls"
                 known = [suite.digest(), row.source, row.seed, here["versions"], here["commit"]]
-                cells = kept_part(out / "parts", key, known, lambda one=row: suite.score(one))
+                cells = kept_part(out / "parts", key, known, lambda one=row: score(suite, one))
                 rows.append({"source": row.source, "seed": row.seed, "cells": cells})
                 advance()
         return {"data": suite.data(), "rows": rows}
 
-    return measure(places, suite, out, about, score, FORM)
+    return measure(places, suite, out, about, measured, FORM)
 
 
 def is_result(path: Path) -> bool:
@@ -92,7 +77,8 @@ def _problems(value: dict[str, Any], suite: Suite) -> Iterator[str]:
     seeds = value["encoder"]["seeds"]
     want = [*((OWN, seed) for seed in seeds), ("pixels", None)]
     want += [("untrained", seed) for seed in range(len(suite.untrained))]
-    rest = [(SHUFFLED, seeds[0]), (suite.true, None), (suite.blind, None), ("end to end", None)]
+    rest = [(TUNED, seeds[0])] if suite.cells(TUNED) else []
+    rest += [(SHUFFLED, seeds[0]), (suite.true, None), (suite.blind, None), ("end to end", None)]
     have = [(row["source"], row["seed"]) for row in value["rows"]]
     if have not in ([*want, *rest], [*want, ("imagenet", None), *rest]):
         yield f"has the rows {have}, the suite asks for {want + rest}"
@@ -106,7 +92,7 @@ def _problems(value: dict[str, Any], suite: Suite) -> Iterator[str]:
             if not np.isfinite(sums).all() or suite.impossible(cell["task"], np.array(cell["n"]), sums):
                 yield f"{who}, {cell['task']}, {cell['condition']}: no episodes give these sums"
     true = next(row["cells"] for row in value["rows"] if row["source"] == suite.true)
-    for cell, again in zip(true, suite.score(Row(suite.true, None, None)), strict=True):
+    for cell, again in zip(true, score(suite, Row(suite.true, None, None)), strict=True):
         if not np.allclose(*([one[key] for key in suite.sums] for one in (cell, again)), rtol=1e-3, atol=1e-3):
             yield f"{suite.true} gives other sums here in {cell['task']}, {cell['condition']}"
 
@@ -116,9 +102,11 @@ def scores(values: Sequence[dict[str, Any]]) -> Scored:
     found: Scored = {}
     for value in values:
         mine: Scored = {}
+        own = value["encoder"]["name"]
         for row in value["rows"]:
+            name = {OWN: own, TUNED: f"{own}, tuned"}.get(row["source"], row["source"])
             for cell in row["cells"]:
-                of = mine.setdefault(row["source"] or value["encoder"]["name"], {})
+                of = mine.setdefault(name, {})
                 of.setdefault((cell["task"], cell["condition"]), []).append({**cell, "seed": row["seed"]})
         found |= mine
     return found
@@ -162,7 +150,7 @@ def print_result(path: Path) -> None:
 
 
 def write_page(files: Sequence[Path], out: Path) -> Path:
-    """Write the page of results of one suite."""
+    """Write the page of results of one suite, with a film of who knows the truth and of no action at all."""
     suites, values = zip(*map(read_control, files), strict=True)
     suite, names = suites[0], [value["encoder"]["name"] for value in values]
     if any(one != suite for one in suites) or len(set(names)) < len(names):
@@ -173,6 +161,11 @@ def write_page(files: Sequence[Path], out: Path) -> Path:
         for number, (title, (columns, rows)) in enumerate(tables(suite, values).items())
     ]
     sections[0][2].insert(0, page.paragraph(note(suite, values)))
+    episodes = suite_episodes(suite, next(cell for cell in suite.cells(OWN) if cell[0] == suite.kinds[2]))
+    still = np.zeros(len(episodes.begin[0]().most))
+    data = encoded(film(episodes, [(suite.true, None, ""), ("no action", lambda given: still, "")]), "webp")
+    image = page.image(data_uri(data, "webp"), "What is seen, and the error in mm and degrees")
+    sections.append(("film", "An episode", [page.figure(image)]))
     text = str(page.page(f"mvitac bench: {suite.name}", head, sections, "Made by mvitac bench board."))
     write_atomic(out, lambda file: file.write(text.encode()))
     return out

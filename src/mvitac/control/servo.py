@@ -239,59 +239,17 @@ def _near(task: Any, shape: Shape, asked: np.ndarray, along: float) -> np.ndarra
     return task.moved(shape, there, asked - task.pose(shape, there))
 
 
-@dataclass(eq=False)
-class Episode:
-    """One shape, followed by one sensor: the world behind a controller or a gymnasium environment."""
-
-    task: Any
-    shape: Shape
-    copy: Copy
-    state: np.ndarray
-    key: tuple[int, ...]  # of its random numbers
-    step: int = 0
-    lost: bool = False
-
-    @classmethod
-    def begin(cls, seed: int, kind: str, number: int, *, new: bool = False, noise: float = 1.0) -> "Episode":
-        """Shape ``number`` of those to follow, with an unseen texture. Its start is the same with every sensor."""
-        task, key = task_of(kind), (seed, 1 + [k for t in TASKS.values() for k in t.kinds].index(kind), number)
-        shape, state = _begun(kind, key)
-        finger = np.random.default_rng([_TOUCH, *key])
-        return cls(task, shape, draw_copy(finger, new=new, noise=noise), state, key)
-
-    @property
-    def pose(self) -> np.ndarray:
-        return self.task.pose(self.shape, self.state)
-
-    def touch(self) -> np.ndarray:
-        """The picture of this moment, uint8 [64, 64, 3]; the same one if asked again."""
-        return self.copy.touch(self.shape, self.state, np.random.default_rng([_TOUCH, *self.key, 1 + self.step]))
-
-    def move(self, change: np.ndarray) -> None:
-        """Advance by one step with a correction of the pose; contact that is lost stays lost."""
-        if not self.lost:
-            self.state = self.task.moved(self.shape, self.state, change)
-            self.lost = bool((np.abs(self.pose - self.task.target) > self.task.limit).any())
-        self.step += 1
-
-    def error(self) -> tuple[float, float]:
-        """Distance from the target, in mm and in degrees; the limits once contact is lost."""
-        away = self.task.limit if self.lost else np.abs(self.pose - self.task.target)
-        return float(away[0]), float(np.hypot.reduce(away[1:]))
-
-
 @lru_cache(maxsize=128)
-def _begun(kind: str, key: tuple[int, ...]) -> tuple[Shape, np.ndarray]:
-    """The shape of an episode and its first state."""
+def begun(kind: str, key: tuple[int, ...]) -> tuple[Shape, np.ndarray]:
+    """Shape and first state of an episode, the same with every sensor; its texture is one that no press had."""
     task, rng = task_of(kind), np.random.default_rng([_DRAW, *key])
     shape = draw_shape(rng, kind, textures(False))
     pose = task.target + rng.uniform(-1, 1, len(task.target)) * task.start
     return shape, task.state(shape, pose, 0.0)
 
 
-def touch_at(asked: tuple[int, str, int, dict[str, Any], np.ndarray, int]) -> np.ndarray:
-    """``Episode.touch`` for other processes: of (seed, kind, number, options) in a state at a step."""
-    seed, kind, number, options, state, step = asked
-    episode = Episode.begin(seed, kind, number, **options)
-    episode.state, episode.step = state, step
-    return episode.touch()
+def picture(asked: tuple[str, tuple[int, ...], bool, float, np.ndarray, int]) -> np.ndarray:
+    """What the sensor of an episode sees at a step: of kind, key, whether it is new, its noise, state and step."""
+    kind, key, new, noise, state, step = asked
+    sensor = draw_copy(np.random.default_rng([_TOUCH, *key]), new=new, noise=noise)
+    return sensor.touch(begun(kind, key)[0], state, np.random.default_rng([_TOUCH, *key, 1 + step]))

@@ -1,4 +1,4 @@
-"""The suite ``servo-v1``: who estimates the pose, and how far from its target each episode then stays."""
+"""The suite ``servo-v1``: one controller follows a shape by a pose that a row estimates, and how far it then is from it."""
 
 import hashlib
 import multiprocessing
@@ -11,9 +11,9 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mvitac.control.learn import Estimate
-from mvitac.control.servo import STEP_MS, TASKS, Episode, presses, task_of, touch_at
-from mvitac.control.suite import SHUFFLED, Cells, LoopSuite, Row
+from mvitac.control.learn import Lesson
+from mvitac.control.servo import STEP_MS, TASKS, begun, picture, presses, task_of
+from mvitac.control.suite import TUNED, Cell, LoopSuite
 from mvitac.evaluation.intervals import mean_interval
 
 
@@ -41,6 +41,8 @@ class Servo(LoopSuite):
     kinds: ClassVar[list[str]] = [kind for task in TASKS.values() for kind in task.kinds]
     true: ClassVar[str] = "true pose"
     blind: ClassVar[str] = "no touch"
+    other: ClassVar[int] = 1
+    failure: ClassVar[str] = "mm"
     note: ClassVar[str] = (
         "Mean error over scored steps with the 95 % interval over shapes (and seeds). Steps after contact was lost have"
         " the largest error"
@@ -57,6 +59,29 @@ class Servo(LoopSuite):
     fit_val: int
     conditions: tuple[Condition, ...]
 
+    @property
+    def num(self) -> int:
+        return self.shapes
+
+    @property
+    def scored(self) -> int:
+        return self.steps - self.settle
+
+    def cells(self, source: str) -> list[Cell]:
+        """The tasks and conditions that a row has."""
+        every = [(kind, condition.name) for kind in self.kinds for condition in self.conditions]
+        return [] if source == TUNED else every
+
+    def world(self, task: str, condition: str, number: int) -> "Episode":
+        return Episode(self, task, next(one for one in self.conditions if one.name == condition), number)
+
+    def lesson(self, cell: Cell) -> str:
+        return next(name for name, task in TASKS.items() if cell[0] in task.kinds)
+
+    def taught(self, lesson: str) -> Lesson:
+        images, poses = self.presses[lesson]
+        return {"touch": images}, poses, self.fit_val * self.fit_presses
+
     @cached_property
     def presses(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Images and poses of each task, rendered once for all rows."""
@@ -71,54 +96,16 @@ class Servo(LoopSuite):
         """Digests of the presses."""
         return {name: hashlib.sha256(images.tobytes()).hexdigest() for name, (images, _) in self.presses.items()}
 
-    def cells(self, source: str) -> list[tuple[str, str]]:
-        """The tasks and conditions that a row has."""
-        return [(kind, condition.name) for kind in self.kinds for condition in self.conditions]
+    def look(self, worlds: Sequence[Any], sense: str) -> np.ndarray:
+        return np.stack(list(_processes().map(picture, [world.moment for world in worlds], chunksize=5)))
 
-    def score(self, row: Row) -> Cells:
-        """Sums of every kind and condition, by shape."""
-        learned: dict[str, Estimate] = {}
-        if row.learn:
-            for name, (images, poses) in self.presses.items():
-                learned[name] = row.learn({"touch": images}, poses, self.fit_val * self.fit_presses)
-        each = [(kind, learned.get(name)) for name, task in TASKS.items() for kind in task.kinds]
-        return [cell for kind, estimate in each for cell in self._follow(kind, estimate, row.source == SHUFFLED)]
-
-    def _follow(self, kind: str, estimate: Estimate | None, shuffle: bool) -> Cells:
-        """All episodes of one kind, in step, so that their images are rendered and encoded together.
-
-        ``estimate`` None: the true pose. With ``shuffle`` each episode gets the image of the next shape.
-        """
-        num, task = self.shapes, task_of(kind)
-        asked = [{"new": one.new_sensor, "noise": one.noise} for one in self.conditions for _ in range(num)]
-        episodes = [Episode.begin(self.seed, kind, i % num, **each) for i, each in enumerate(asked)]
-        late = np.repeat([one.latency_ms // STEP_MS for one in self.conditions], num)
-        order = np.arange(len(episodes))
-        other = order - order % num + (order + 1) % num  # the next shape under the same condition
-
-        def look(modality: str) -> np.ndarray:
-            wanted = [(self.seed, kind, i % num, asked[i], e.state, e.step) for i, e in enumerate(episodes)]
-            images = np.stack(list(_processes().map(touch_at, wanted, chunksize=5)))
-            return images[other] if shuffle else images
-
-        sums, bound = np.zeros((len(episodes), len(self.sums))), self.most * task.limit
-        known: list[np.ndarray] = []
-        for step in range(self.steps):
-            poses = np.stack([episode.pose for episode in episodes])
-            known.append(np.broadcast_to(estimate(look), poses.shape) if estimate else poses)
-            for i, episode in enumerate(episodes):
-                away = known[max(0, step - late[i])][i] - task.target
-                episode.move(np.clip(-self.gain * away, -bound, bound))
-                if step >= self.settle:
-                    sums[i] += (*episode.error(), episode.lost)
-        n = [float(self.steps - self.settle)] * num
-        parts = zip(self.conditions, sums.reshape(-1, num, len(self.sums)), strict=True)
-        return [self.cell(kind, one.name, n, lines.T) for one, lines in parts]
+    def lost(self, result: Sequence[float]) -> float:
+        return result[0] / self.scored
 
     def impossible(self, task: str, n: np.ndarray, sums: np.ndarray) -> bool:
         """Whether no episodes give these sums [3, shapes]: steps without contact have the limit."""
         mm, deg, lost = sums
-        most, fits = task_of(task).limit, (n == self.steps - self.settle).all() and n.shape == mm.shape
+        most, fits = task_of(task).limit, (n == self.scored).all() and n.shape == mm.shape
         fits &= len(n) == self.shapes and (lost >= 0).all() and (lost == lost.round()).all()
         for each, limit in ((mm, most[0]), (deg, np.hypot.reduce(most[1:]))):
             fits &= bool((each >= lost * limit - 1e-6).all() and (each <= n * limit + 1e-6).all())
@@ -132,3 +119,67 @@ class Servo(LoopSuite):
         return f"{mean:.2f} [{low:.2f}, {high:.2f}] mm, {deg.mean():.1f}°" + (
             f", {share:.0f} % lost" if share >= 0.5 else ""
         )
+
+
+class Episode:
+    """One shape, followed by one sensor. An action is the correction of the pose; contact that is lost stays lost."""
+
+    senses = ("touch",)
+
+    def __init__(self, suite: Servo, kind: str, condition: Condition, number: int) -> None:
+        self.suite, self.kind, self.condition, self.task = suite, kind, condition, task_of(kind)
+        self.key = suite.seed, 1 + suite.kinds.index(kind), number
+        self.shape, first = begun(kind, self.key)
+        self.states, self.lost, self.sums = [first], False, np.zeros(3)
+        self.most = suite.most * self.task.limit
+
+    @property
+    def pose(self) -> np.ndarray:
+        return self.task.pose(self.shape, self.states[-1])
+
+    @property
+    def shown(self) -> int:
+        """The step that is seen now."""
+        return max(0, len(self.states) - 1 - self.condition.latency_ms // STEP_MS)
+
+    @property
+    def moment(self) -> Any:
+        """What ``servo.picture`` takes."""
+        condition = self.condition
+        return self.kind, self.key, condition.new_sensor, condition.noise, self.states[self.shown], self.shown
+
+    @property
+    def known(self) -> np.ndarray:
+        return self.task.pose(self.shape, self.states[self.shown])
+
+    @property
+    def over(self) -> bool:
+        return len(self.states) > self.suite.steps
+
+    @property
+    def error(self) -> tuple[float, float]:
+        """Distance from the target; the limits once contact is lost."""
+        away = self.task.limit if self.lost else np.abs(self.pose - self.task.target)
+        return float(away[0]), float(np.hypot.reduce(away[1:]))
+
+    @property
+    def reward(self) -> float:
+        """Minus the error, in parts of the limit."""
+        mm, deg = self.error
+        return -float(mm / self.task.limit[0] + deg / np.hypot.reduce(self.task.limit[1:]))
+
+    def look(self, sense: str) -> np.ndarray:
+        return picture(self.moment)
+
+    def answer(self, estimate: np.ndarray) -> np.ndarray:
+        return np.clip(-self.suite.gain * (estimate - self.task.target), -self.most, self.most)
+
+    def step(self, action: np.ndarray) -> None:
+        state = self.states[-1] if self.lost else self.task.moved(self.shape, self.states[-1], action)
+        self.states.append(state)
+        self.lost |= bool((np.abs(self.pose - self.task.target) > self.task.limit).any())
+        if len(self.states) - 1 > self.suite.settle:
+            self.sums += (*self.error, self.lost)
+
+    def result(self) -> tuple[float, ...]:
+        return tuple(self.sums)

@@ -1,19 +1,32 @@
-"""What closed-loop suites share (``suites/*.toml``): a definition with every criterion as data, and the rows to score."""
+"""What closed-loop suites share: a definition with every criterion as data (``suites/*.toml``), and the rows to score.
+
+A suite makes *worlds*, episodes that begin, of a task under a condition:
+
+    world = find_suite("servo-v1").world("corner", "known sensor", 3)
+    while not world.over:
+        world.step(world.answer(world.known))
+
+``look(sense)`` is all that a policy gets, uint8 [64, 64, 3]; ``known`` is the truth about what a row estimates, ``answer``
+the action that an estimate leads to, ``most`` the largest action. ``error`` is that of now, in mm and degrees; ``result()``
+the suite's sums of the episode, ``reward`` that of the last step.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Any, ClassVar
 
 import numpy as np
 
+from mvitac.bench.external import open_model
 from mvitac.bench.score import trunks
-from mvitac.control.learn import Learn, blind, encoding, end_to_end, pixels, ridge
+from mvitac.control.learn import Estimate, Learn, blind, encoding, pixels, ridge, trained
 from mvitac.model import Model
 from mvitac.registry import to_json
 from mvitac.system.files import digest
 
-Cells = list[dict[str, Any]]  # task, condition, n, and a list for each of ``LoopSuite.sums``
-OWN, SHUFFLED = "", "touch shuffled"  # rows of the encoder that is scored
+Cell = tuple[str, str]  # task and condition
+OWN, SHUFFLED, TUNED = "", "touch shuffled", "tuned"  # rows of the encoder that is scored
 
 
 @dataclass(frozen=True)
@@ -33,6 +46,8 @@ class LoopSuite:
     kinds: ClassVar[list[str]]  # of tasks: the columns of a table
     true: ClassVar[str]
     blind: ClassVar[str]
+    other: ClassVar[int]  # which next episode's touch the row "touch shuffled" gets
+    failure: ClassVar[str]  # what ``lost`` counts
     note: ClassVar[str]
 
     name: str
@@ -51,22 +66,56 @@ class LoopSuite:
     def digest(self) -> str:
         return digest(self.definition())
 
-    def rows(self, models: Sequence[Model]) -> list[Row]:
-        """The encoder's seeds first, then the controls; ImageNet only where its weights can be had."""
-        own = [Row(OWN, model.seed, ridge(encoding(model))) for model in models]
-        beside = [
-            Row(name, None if name == "imagenet" else model.seed, ridge(encoding(model)))
-            for name, model in trunks(self)
-        ]
-        known = Row(self.true, None, None), Row(self.blind, None, blind)
-        trained = Row("end to end", None, end_to_end(self.untrained[0], self.train_steps))
-        return [*own, Row("pixels", None, ridge(pixels)), *beside, replace(own[0], source=SHUFFLED), *known, trained]
-
-    def cell(self, task: str, condition: str, n: Sequence[float], sums: np.ndarray) -> dict[str, Any]:
-        """A cell of a row, from the sums [len(self.sums), N] of its shapes or episodes in ten digits."""
-        each = {key: [float(f"{x:.10g}") for x in line] for key, line in zip(self.sums, sums.tolist(), strict=True)}
-        return {"task": task, "condition": condition, "n": list(n), **each}
+    def look(self, worlds: Sequence[Any], sense: str) -> np.ndarray:
+        """What all episodes show now, uint8 [E, 64, 64, 3]."""
+        return np.stack([world.look(sense) for world in worlds])
 
     def record(self, cell: dict[str, Any]) -> dict[str, Any]:
         """A cell as ``evaluation.intervals`` takes it: the score, by shape or episode."""
         return {"seed": cell["seed"], "group_sizes": cell["n"], "group_correct": cell[self.sums[0]]}
+
+
+def rows_of(suite: Any, models: Sequence[Model]) -> list[Row]:
+    """The encoder's seeds first, then the controls; ImageNet only where its weights can be had."""
+    first = models[0]
+    own = [Row(OWN, model.seed, ridge(encoding(model))) for model in models]
+    beside = [
+        Row(name, None if name == "imagenet" else model.seed, ridge(encoding(model))) for name, model in trunks(suite)
+    ]
+    tuned = [Row(TUNED, first.seed, trained(first, suite.train_steps, 3e-4))] if suite.cells(TUNED) else []
+    known = Row(suite.true, None, None), Row(suite.blind, None, blind)
+    scratch = Row("end to end", None, trained(open_model(suite.untrained[0]), suite.train_steps, 2e-3))
+    shuffled = Row(SHUFFLED, first.seed, own[0].learn)
+    return [*own, Row("pixels", None, ridge(pixels)), *beside, *tuned, shuffled, *known, scratch]
+
+
+def score(suite: Any, row: Row) -> list[dict[str, Any]]:
+    """The cells of a row: task, condition, n, and for each of the suite's sums a list of its episodes, in ten digits."""
+    found, num = [], suite.num
+    for lesson, each in groupby(suite.cells(row.source), suite.lesson):
+        cells = list(each)
+        worlds = [suite.world(*cell, number) for cell in cells for number in range(num)]
+        _run(suite, worlds, row.learn(*suite.taught(lesson)) if row.learn else None, row.source == SHUFFLED)
+        sums = np.array([world.result() for world in worlds], float).reshape(len(cells), num, -1)
+        for (task, condition), lines in zip(cells, sums, strict=True):
+            lists = [[float(f"{x:.10g}") for x in line] for line in lines.T]
+            about = {"task": task, "condition": condition, "n": [float(suite.scored)] * num}
+            found.append(about | dict(zip(suite.sums, lists, strict=True)))
+    return found
+
+
+def _run(suite: Any, worlds: Sequence[Any], estimate: Estimate | None, shuffle: bool) -> None:
+    """All episodes in step, so that images are made and encoded together. ``estimate`` None knows the truth."""
+
+    def look(sense: str) -> np.ndarray:
+        images = suite.look(worlds, sense)
+        if not shuffle or sense != "touch":
+            return images
+        by_cell = images.reshape(-1, suite.num, *images.shape[1:])
+        return np.roll(by_cell, -suite.other, axis=1).reshape(images.shape)
+
+    while not worlds[0].over:
+        known = np.stack([world.known for world in worlds])
+        found = np.broadcast_to(estimate(look), known.shape) if estimate else known
+        for world, each in zip(worlds, found, strict=True):
+            world.step(world.answer(each))
