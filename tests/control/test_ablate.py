@@ -14,7 +14,7 @@ from PIL import Image
 from mvitac.cli.main import main
 from mvitac.control.ablate import Recorded, ablate, act, open_policy, read_episodes, suite_episodes, suite_policy
 from mvitac.control.find import find_suite
-from mvitac.control.video import film, write_film
+from mvitac.control.video import encoded, film
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample, Source
@@ -161,7 +161,7 @@ def test_in_a_closed_loop_success_is_the_measure() -> None:
     changes = {row["kind"]: row["error"][0] for row in felt["rows"] if row["sense"] == "touch"}
     assert felt["error"][0] == 0 and changes["10 frames ago"] == 0  # the grasp does not change
     assert all(changes[kind] > 0.6 for kind in ("another episode", "mean frame", "noise"))
-    blind = ablate(lambda o: [5.0, 0.0], suite_episodes(suite, ("both", "30")))
+    blind = ablate(lambda o: [5.0 + o["state"][0], 0.0], suite_episodes(suite, ("both", "30")))
     assert blind["verdicts"]["touch"].startswith("The policy does not use touch") and blind["error"][0] > 0.8
 
 
@@ -171,12 +171,12 @@ def test_film_and_learned_policy(tmp_path: Path, capsys: pytest.CaptureFixture[s
     result = ablate(suite_policy(suite, ("touch", "4"), "pixels"), episodes)
     assert [row["sense"] for row in result["rows"]] == ["touch"] * 4 and result["unit"] == "failures"
     pictures = film(episodes, [("expert", None, ""), ("none", lambda o: [0.0, 0.0], "mean frame")])
-    write_film(tmp_path / "a.webp", pictures)
+    (tmp_path / "a.webp").write_bytes(encoded(pictures, "webp"))
     with Image.open(tmp_path / "a.webp") as made:
-        assert made.n_frames == 18 and made.size == (384, 256)
-    write_film(tmp_path / "a.jpg", pictures)
+        assert made.n_frames == 18 and made.size == (288, 288)
+    (tmp_path / "a.jpg").write_bytes(encoded(pictures, "jpg"))
     with Image.open(tmp_path / "a.jpg") as made:
-        assert made.height == 5 * 256
+        assert made.size == (3 * 288, 288)
     for text, why in (("insert-v1/touch/31", "unknown task and condition"), ("nowhere", "--out is a film of a suite")):
         assert main(["ablate", "pixels", "--data", text, "--out", str(tmp_path / "b.webp")]) == 2
         assert why in capsys.readouterr().err

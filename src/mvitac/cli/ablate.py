@@ -9,7 +9,7 @@ from mvitac.cli.options import check_json, parse, printed_to, save_json
 from mvitac.control.ablate import PLAUSIBLE, open_policy, read_episodes, report, suite_episodes, suite_policy
 from mvitac.control.ablate import ablate as compare
 from mvitac.control.find import find_suite, shipped
-from mvitac.control.video import film, write_film
+from mvitac.control.video import encoded, film
 from mvitac.data.pack import Pack
 from mvitac.system.progress import shown
 
@@ -47,6 +47,6 @@ def ablate(argv: list[str]) -> None:
         result = compare(policy, episodes)
     if options.out:
         runs = [("as it is", policy, ""), ("touch of another episode", policy, PLAUSIBLE[0])]
-        write_film(options.out, film(episodes, runs))
+        options.out.write_bytes(encoded(film(episodes, runs), options.out.suffix[1:]))
     print(report(result), file=printed_to(options.json))
     save_json(options.json, result, sealed=True)

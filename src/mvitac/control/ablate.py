@@ -4,8 +4,9 @@ A policy is a function of an observation, called for each step of an episode in 
 
     {"touch": uint8 [H, W, C], "vision": uint8 [H, W, 3], "step": 17, "state": float [S]} -> action [T]
 
-"state" is every task of values of a pack except "action", by its own name. A policy with memory has ``reset()``, which is
-called before each episode; one that draws at random seeds itself there, or its own noise counts as change.
+"state" is every task of values of a pack except "action", by its own name; in a suite the way in mm, or the hand's x and
+turn. A policy with memory has ``reset()``, which is called before each episode; one that draws at random seeds itself
+there, or its own noise counts as change.
 
 Changes are in standard deviations of the action, the mean over its components; one that never changes is 0. The error in
 recorded episodes is the distance to the demonstrated action, in the same unit; in those of a suite what an episode lost.
@@ -166,16 +167,12 @@ def lerobot_policy(folder: Path) -> Policy:
     return act
 
 
-def nothing(world: Any, given: dict[str, Any]) -> None:
-    pass
-
-
 def act(
     policy: Policy | None,
     episodes: Episodes,
     sense: str = "",
     kind: str = "",
-    watch: Callable[[Any, dict[str, Any]], None] = nothing,
+    watch: Callable[[Any, dict[str, Any]], None] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Actions [N, T] of every step with ``sense`` replaced by ``kind``, what its episode lost [N], steps of each episode.
 
@@ -191,7 +188,8 @@ def act(
             if replaced:
                 seen.append(given[sense])
                 given[sense] = replaced(number, step, seen[0])
-            watch(world, given)
+            if watch:
+                watch(world, given)
             action = np.asarray(policy(given) if policy else world.answer(world.known), float).ravel()
             width = len(world.most) if episodes.actions is None else episodes.actions.shape[1]
             if len(action) != width:
@@ -234,7 +232,7 @@ def ablate(policy: Policy, episodes: Episodes) -> dict[str, Any]:
 
     rows: list[dict[str, Any]] = []
     with work("acting", 1 + len(episodes.senses) * len(KINDS), "times") as advance:
-        normal, own, steps = act(policy, episodes, watch=nothing if episodes.images else keep)
+        normal, own, steps = act(policy, episodes, watch=None if episodes.images else keep)
         advance()
         if not episodes.images:
             episodes.images, episodes.rows = {sense: np.stack(images) for sense, images in seen.items()}, steps

@@ -85,6 +85,10 @@ class Insertion:
         return np.array([self.slot_mm - self.peg.offset_mm * math.cos(math.radians(turn)), turn])
 
     @property
+    def values(self) -> dict[str, np.ndarray]:
+        return {"state": np.array([self.x_mm, self.turn_deg])}
+
+    @property
     def over(self) -> bool:
         return self.steps == ALIGN + DOWN
 
@@ -108,7 +112,7 @@ class Insertion:
         return estimate
 
     def step(self, action: np.ndarray) -> None:
-        own = np.array([self.x_mm, self.turn_deg])
+        own = self.values["state"]
         self.x_mm, self.turn_deg = own + np.clip(GAIN * (action - own), -MOST, MOST)
         self.steps += 1
         self._go()

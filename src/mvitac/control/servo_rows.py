@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from mvitac.control.learn import Lesson
-from mvitac.control.servo import STEP_MS, TASKS, begun, picture, presses, task_of
+from mvitac.control.servo import STEP_MM, STEP_MS, TASKS, begun, picture, presses, task_of
 from mvitac.control.suite import TUNED, Cell, LoopSuite
 from mvitac.evaluation.intervals import mean_interval
 
@@ -147,6 +147,10 @@ class Episode:
         """What ``servo.picture`` takes."""
         condition = self.condition
         return self.kind, self.key, condition.new_sensor, condition.noise, self.states[self.shown], self.shown
+
+    @property
+    def values(self) -> dict[str, np.ndarray]:
+        return {"state": np.array([STEP_MM * (len(self.states) - 1)])}
 
     @property
     def known(self) -> np.ndarray:

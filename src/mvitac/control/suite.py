@@ -6,9 +6,9 @@ A suite makes *worlds*, episodes that begin, of a task under a condition:
     while not world.over:
         world.step(world.answer(world.known))
 
-``look(sense)`` is all that a policy gets, uint8 [64, 64, 3]; ``known`` is the truth about what a row estimates, ``answer``
-the action that an estimate leads to, ``most`` the largest action. ``error`` is that of now, in mm and degrees; ``result()``
-the suite's sums of the episode, ``reward`` that of the last step.
+``look(sense)``, uint8 [64, 64, 3], and ``values`` are all that a policy gets. ``known`` is the truth about what a row
+estimates, ``answer`` the action that an estimate leads to, ``most`` the largest action. ``error`` is that of now, in mm and
+degrees, ``reward`` that of the last step, and ``result()`` the suite's sums of the episode.
 """
 
 from collections.abc import Sequence

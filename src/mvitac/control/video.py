@@ -3,7 +3,6 @@
 import io
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from PIL import Image, ImageDraw
 
 from mvitac.control.ablate import Episodes, Policy, act
 
-SIDE, MOMENTS = 128, 5
+SIDE, MOMENTS = 144, 3
 Run = tuple[str, Policy | None, str]  # title, policy (None: who knows the truth), what replaces touch
 
 
@@ -29,23 +28,25 @@ def film(episodes: Episodes, runs: Sequence[Run]) -> list[Image.Image]:
     pictures = []
     for step in range(len(shown[0])):
         wide = shown[0][0].shape[1] // shown[0][0].shape[0] * SIDE
-        picture = Image.new("RGB", (wide + 2 * SIDE, len(runs) * SIDE), "white")
+        picture = Image.new("RGB", (wide + SIDE, len(runs) * SIDE), "white")
         for run, (title, *_) in enumerate(runs):
             image = Image.fromarray(shown[run][step]).resize((wide, SIDE), Image.Resampling.NEAREST)
             picture.paste(image, (0, run * SIDE))
-            _trace(picture, (wide, run * SIDE), title, np.array(errors[run][: step + 1]), np.max(errors, axis=(0, 1)))
+            _trace(picture, (wide, run * SIDE), title, np.array(errors[run]), step, np.max(errors, axis=(0, 1)))
         pictures.append(picture)
     return pictures
 
 
-def _trace(picture: Image.Image, at: tuple[int, int], title: str, errors: np.ndarray, most: np.ndarray) -> None:
-    """Errors [steps, 2] so far, each in parts of the most of all runs."""
+def _trace(
+    picture: Image.Image, at: tuple[int, int], title: str, errors: np.ndarray, step: int, most: np.ndarray
+) -> None:
+    """Errors [steps, 2] up to ``step``, in parts of the most of all runs."""
     draw = ImageDraw.Draw(picture)
     draw.text((at[0] + 6, at[1] + 2), title, "black")
     for line, (unit, colour) in enumerate((("mm", "#0072b2"), ("°", "#d55e00"))):
-        draw.text((at[0] + 6 + 60 * line, at[1] + 14), f"{errors[-1, line]:.1f} {unit}", colour)
-        y = at[1] + SIDE - 6 - (SIDE - 40) * errors[:, line] / most[line]
-        draw.line([(at[0] + 6 + 6 * x, float(each)) for x, each in enumerate(y)], colour, 2)
+        draw.text((at[0] + 6 + 60 * line, at[1] + 14), f"{errors[step, line]:.1f} {unit}", colour)
+        y = at[1] + SIDE - 6 - (SIDE - 40) * errors[: step + 1, line] / most[line]
+        draw.line([(at[0] + 6 + (SIDE - 12) * x / len(errors), float(each)) for x, each in enumerate(y)], colour, 2)
 
 
 def encoded(pictures: Sequence[Image.Image], kind: str) -> bytes:
@@ -55,9 +56,5 @@ def encoded(pictures: Sequence[Image.Image], kind: str) -> bytes:
         pictures[0].save(buffer, kind, save_all=True, append_images=pictures[1:], duration=100, loop=0)
     else:
         some = [pictures[i] for i in np.linspace(0, len(pictures) - 1, MOMENTS).round().astype(int)]
-        Image.fromarray(np.vstack([np.asarray(each) for each in some])).save(buffer, kind.replace("jpg", "jpeg"))
+        Image.fromarray(np.hstack([np.asarray(each) for each in some])).save(buffer, kind.replace("jpg", "jpeg"))
     return buffer.getvalue()
-
-
-def write_film(out: Path, pictures: Sequence[Image.Image]) -> None:
-    out.write_bytes(encoded(pictures, out.suffix[1:]))
