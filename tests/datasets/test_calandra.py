@@ -184,18 +184,6 @@ def test_a_truncated_shard_is_named(folder: Path, tmp_path: Path) -> None:
     assert CalandraConfig(path=path.parent, shards=(2,)).source().items()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"split": "random"}, "unknown split 'random'"),
-        ({"phases": ("before", "during"), "ask": ("after",)}, "phases leaves 'after' out"),
-    ],
-)
-def test_impossible_options_are_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        CalandraConfig(**options)
-
-
 def test_missing_data_is_said(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="is not a folder"):
         CalandraConfig(path=tmp_path / "nowhere").source()

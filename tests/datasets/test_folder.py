@@ -112,13 +112,6 @@ def test_every_image_stands_beside_its_own_row(tmp_path: Path, rows: Table, opti
         assert (("metal", "wood", "")[label]) == rows[row]["material"]
 
 
-def test_two_sensors_stack_in_the_order_given(tmp_path: Path, rows: Table) -> None:
-    options = config(write(rows, tmp_path / "manifest.csv"), touch=("right", "left"), vision="")
-    pack = packed(options, tmp_path / "pack")
-    assert pack.spec.modalities == ("touch",)
-    assert (pack.images["touch"][5] == (*colour(5, 2), *colour(5, 1))).all()
-
-
 def test_csv_parquet_and_jsonl_give_one_pack(tmp_path: Path, rows: Table) -> None:
     digests, options = set(), {"split": "side", "controls": ("width=width", "which=object"), "labels": ("stiffness",)}
     for suffix in ("csv", "parquet", "jsonl"):
@@ -210,14 +203,6 @@ def test_an_unfinished_pack_of_files_that_have_all_changed_mixes_no_old_pixels(t
     assert (pack.images["touch"][:, :, :, 0] == 90).all()
     straight = packed(options, tmp_path / "straight")
     assert (pack.path / "pack.json").read_bytes() == (straight.path / "pack.json").read_bytes()
-
-
-def test_an_unfinished_pack_of_another_table_is_not_continued(tmp_path: Path) -> None:
-    options = write_plain(tmp_path / "set", 200, 10)
-    (tmp_path / "set" / "5.bmp").write_bytes(b"x")
-    for changed in ({}, {"only": ("split!=val",)}):
-        with pytest.raises(ValueError, match="something else" if changed else "cannot be read"):
-            packed(replace(options, **changed), tmp_path / "p")
 
 
 def test_classes_sort_by_name_or_by_number_and_pandas_gaps_do_not_matter(tmp_path: Path, rows: Table) -> None:
@@ -312,17 +297,25 @@ def picture(path: Path, shade: int = 0) -> Path:
     return path
 
 
-def test_class_folders_pair_by_name(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["pairs", "a gap", "plain"])
+def test_class_folders_pair_by_name(tmp_path: Path, kind: str) -> None:
     for i in range(12):
-        kind = ("brick", "moss")[i % 2]
-        picture(tmp_path / f"vision/{kind}/{i}.png", i)
-        picture(tmp_path / f"touch/{kind}/{i}.bmp", 100 + i)
-    (tmp_path / "vision/brick/notes.txt").write_text("no image")
-    pack = packed(FolderConfig(path=tmp_path, size=16), tmp_path / "pack")
-    assert pack.spec.tasks[0].classes == ("brick", "moss")
-    assert pack.num == 12
-    assert (pack.images["touch"][:, 0, 0, 0] == pack.images["vision"][:, 0, 0, 0] + 100).all()
-    assert (pack.column("label_label") == pack.images["vision"][:, 0, 0, 0] % 2).all()
+        label = ("brick", "moss")[i % 2]
+        picture(tmp_path / ("" if kind == "plain" else "vision") / label / f"{i}.png", i)
+        if kind == "pairs" or (kind == "a gap" and i != 5):
+            picture(tmp_path / f"touch/{label}/{i}.bmp", 100 + i)
+    config = FolderConfig(path=tmp_path, size=16, pictures="vision")
+    if kind == "a gap":
+        with pytest.raises(ValueError, match=r"\(vision/moss/5\.png\) has no touch path: .*allow-missing"):
+            config.source()
+        config = replace(config, allow_missing=True)
+    pack = packed(config, tmp_path / "pack")
+    seen = pack.images["vision"][:, 0, 0, 0]
+    assert pack.spec.tasks[0].classes == ("brick", "moss") and sorted(seen) == list(range(12))
+    assert (pack.column("label_label") == seen % 2).all()
+    if kind != "plain":
+        assert (pack.images["touch"][:, 0, 0, 0] == (seen + 100) * pack.has("touch")).all()
+        assert pack.column("group")[~pack.has("touch")].tolist() == ["/moss/5"] * (kind == "a gap")
 
 
 def test_class_folders_may_be_grouped_and_split(tmp_path: Path) -> None:
@@ -420,7 +413,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "animation": (damage_frames, "2 frames"),
     "float": (lambda path: Image.fromarray(np.ones((8, 8), np.float32)).save(path, "TIFF"), "floating-point"),
     "32 bit": (lambda path: Image.fromarray(np.full((8, 8), 70000, np.int32)).save(path, "TIFF"), "not 0 to 65535"),
-    "other size": (lambda path: Image.new("RGB", (9, 9)).save(path), "one size"),
+    "other size": (lambda path: Image.new("RGB", (9, 9)).save(path), "need one"),
     "gone": (lambda path: path.unlink(), "does not exist"),
 }
 
@@ -510,37 +503,16 @@ def one(number: int, **cells: Any) -> Change:
     return lambda rows: rows[number - 1].update(cells)
 
 
-def without(*columns: str) -> Change:
-    return lambda rows: [row.pop(column) for row in rows for column in columns]
-
-
 def numbered(**patterns: str) -> Change:
     return lambda rows: [row.update({k: v.format(i) for k, v in patterns.items()}) for i, row in enumerate(rows)]
 
 
-def many_names(rows: Table) -> None:
-    rows[:] = [{**rows[i % NUM], "side": f"s{i}"} for i in range(3 * NUM)]
-
-
 BAD: dict[str, tuple[Change | None, dict[str, Any], str]] = {
     "unknown label": (None, {"labels": ("materials",)}, r"unknown column 'materials'.*did you mean 'material'"),
-    "unknown group": (None, {"group": "objekt"}, r"'objekt'.*did you mean 'object'"),
-    "unknown touch group": (None, {"touch_group": "grasp"}, r"unknown column 'grasp': choose from vision, left"),
-    "unknown split": (None, {"split": "fold"}, r"unknown column 'fold'"),
-    "unknown vision": (None, {"vision": "visoin"}, r"'visoin'.*did you mean 'vision'"),
-    "unknown touch": (None, {"touch": ("lefft",)}, r"'lefft'.*did you mean 'left'"),
-    "unknown control": (None, {"controls": ("w=wide",)}, r"'wide'"),
-    "unknown filter": (None, {"only": ("seqq<=1",)}, r"'seqq'.*did you mean 'seq'"),
-    "unknown label filter": (None, {"label_only": ("sek=1",)}, r"'sek'"),
-    "no image column": (without("vision", "left", "right"), {}, r"has no column vision, touch, or left"),
-    "one gel only": (without("vision", "right"), {}, r"name the image columns"),
-    "empty manifest": (lambda rows: rows.clear(), {}, r"m\.csv holds no rows"),
     "missing file": (one(7, left="left/none.png"), {}, r"1 of 72 image files .*row 7 left left/none\.png"),
     "many missing files": (numbered(vision="no/{}.png"), {}, r"24 of 72 .*row 1 vision .*row 3"),
-    "folder for a file": (one(2, vision="vision"), {}, r"row 2 vision vision"),
     "empty path": (one(3, right=""), {}, r"row 3 .*has no right path"),
     "one class": (each(material="wood"), {}, r"'material' has only the class 'wood' in 24 rows"),
-    "no labels": (each(material=""), {}, r"'material' has no labels"),
     "NaN labels": (each(material=float("nan")), {}, r"'material' has no labels"),
     "label like a name": (numbered(material="m{}"), {}, r"'material' has another value in each of its 24 rows"),
     "empty group": (one(9, object=""), {}, r"row 9 .*column 'object' \(group\) is empty"),
@@ -552,10 +524,8 @@ BAD: dict[str, tuple[Change | None, dict[str, Any], str]] = {
     "validation": (
         one(13, side="validation"),
         {"split": "side"},
-        r"row 13: unknown split in column 'side' 'validation': choose from train, val, test, unlabelled; or --data",
+        r"row 13: unknown split in column 'side' 'validation': choose from train, val, test, unlabelled",
     ),
-    "Train": (one(1, side="Train"), {"split": "side"}, r"row 1: .*did you mean 'train'"),
-    "strange split": (one(1, side="fold1"), {"split": "side"}, r"row 1: .*'fold1'.*by-group"),
     "leak of a group": (
         one(1, side="test"),
         {"split": "side"},
@@ -570,13 +540,11 @@ BAD: dict[str, tuple[Change | None, dict[str, Any], str]] = {
         r"'side' gives label 'material' no labelled rows in test",
     ),
     "one group": (each(object="a"), {}, r"assigning 1 groups gives label 'material' no labelled rows in test"),
-    "filter leaves nothing": (None, {"only": ("seq>=9",)}, r"no row meets seq>=9"),
     "control with gaps": (
         one(4, width=""),
         {"controls": ("w=width",)},
         r"row 4 .*control column 'width' is empty",
     ),
-    "control of names": (many_names, {"controls": ("w=side",)}, r"'side' has 72 texts, e\.g\. .*: at most 64"),
     "id twice": (each(id="a"), {}, r"id 'a' occurs in several rows"),
     "vision is touch": (
         None,
@@ -601,17 +569,9 @@ def test_bad_manifests_are_named_before_anything_is_written(tmp_path: Path, rows
 
 
 BAD_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
-    "three sensors": ({"touch": ("a", "b", "c")}, "touch a b c: give one column, or two"),
-    "label twice": ({"labels": ("a", "a")}, "task 'a' occurs twice"),
     "shares": ({"test_share": 0.6, "val_share": 0.4}, "leave nothing to train on"),
-    "negative share": ({"val_share": -0.1}, "val_share -0.1"),
-    "NaN share": ({"test_share": float("nan")}, "test_share nan"),
-    "seed": ({"split_seed": -1}, "split_seed -1"),
     "control named like ours": ({"controls": ("border=width",)}, "'border' is always computed"),
-    "control twice": ({"controls": ("a=b", "a=c")}, "a name of its own"),
     "condition": ({"only": ("seq",)}, "condition 'seq': write column=value"),
-    "condition <": ({"only": ("seq<4",)}, "condition 'seq<4'"),
-    "condition on text": ({"label_only": ("seq<=few",)}, "column<=number"),
 }
 
 
@@ -623,16 +583,9 @@ def test_bad_options_are_named_at_once(name: str) -> None:
 
 
 BAD_FILES: dict[str, tuple[str, bytes, str]] = {
-    "semicolons": ("m.csv", b"vision;touch\na;b\na;b;c\n", "row 2 has 3 cells for 2 columns"),
     "ragged": ("m.csv", b"vision,touch\na,b\na,b,c\n", "row 2 has 3 cells for 2 columns"),
     "header twice": ("m.csv", b"vision,vision\na,b\n", "two columns of one name"),
     "latin-1": ("m.csv", "vision,touch\nMöbel,b\n".encode("latin-1"), "cannot be read as a table: 'utf-8' codec"),
-    "only a header": ("m.csv", b"vision,touch\n", "holds no rows"),
-    "nothing": ("m.csv", b"", "holds no rows"),
-    "broken json": ("m.jsonl", b'{"vision": "a"}\n{"vision":\n', "cannot be read as a table"),
-    "json list": ("m.jsonl", b"[1]\n", "one object"),
-    "no parquet": ("m.parquet", b"PAR1 not really", "cannot be read as a table"),
-    "spreadsheet": ("m.xlsx", b"PK", r"must end in .csv, .parquet, .jsonl"),
 }
 
 
@@ -651,14 +604,9 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
         with pytest.raises(ValueError, match=says):
             FolderConfig(path=path).source()
 
-    refused(tmp_path / "nowhere", "does not exist: give a manifest")
     for suffix in ("csv", "jsonl"):
         write(rows, tmp_path / f"manifest.{suffix}")
     refused(tmp_path, "manifest.csv and manifest.jsonl")
-    (tmp_path / "bare").mkdir()
-    refused(tmp_path / "bare", "holds no manifest, HDF5 file, videos or images")
-    (tmp_path / "empty/vision").mkdir(parents=True)
-    refused(tmp_path / "empty", "HDF5 file, videos or images")
     lonely = tmp_path / "lonely"
     picture(lonely / "vision/a/1.png")
     picture(lonely / "touch/b/1.png")
@@ -669,26 +617,9 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
     for suffix in ("png", "bmp"):
         picture(tmp_path / f"twins/touch/a/1.{suffix}")
     refused(tmp_path / "twins", "differ in their suffix only")
-    for name in ("train/vision/a/1", "train/touch/a/1", "test/touch/a/2"):
-        picture(tmp_path / f"half/{name}.png")
-    refused(tmp_path / "half", r"test/touch/a/2\.png\) has no vision path")
     for name in ("train/a/1", "test/b/2", "validation/a/3"):
         picture(tmp_path / f"beside/{name}.png")
     refused(tmp_path / "beside", "images in validation beside train, test: rename or remove it")
-
-
-def test_the_command_says_it_in_one_line(tmp_path: Path, rows: Table, capsys: pytest.CaptureFixture[str]) -> None:
-    file = write(rows, tmp_path / "m.csv")
-    common = ["data", "pack", "--data", "folder", "--path", str(file), "--quiet"]
-    assert main([*common, "--labels", "materiel", "--out", str(tmp_path / "bad")]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("mvitac: error: ")
-    assert error.count("\n") == 1
-    assert "did you mean 'material'" in error
-    assert not list(tmp_path.glob("bad*"))
-    good = f"--labels material --group object --size 16 --only seq<=1 --out {tmp_path / 'good'}".split()
-    assert main([*common, *good]) == 0
-    assert Pack(tmp_path / "good").num == 16
 
 
 # -- the real sets, where they are ------------------------------------------------------------------------------------
@@ -723,24 +654,6 @@ def test_real_sets_read_whole(tmp_path: Path, name: str) -> None:
     groups = {split: set(pack.column("group")[pack.rows(split)]) for split in ("train", "val", "test")}
     assert not groups["test"] & (groups["train"] | groups["val"])
     assert all(images.reshape(len(images), -1).std(1).min() > 1 for images in pack.images.values())
-
-
-def test_paths_as_other_computers_write_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Backslashes and ~ give the same pack; a file that has exactly this name comes first."""
-    monkeypatch.setenv("HOME", str(tmp_path))
-    rows = make_rows(tmp_path)
-    Image.new("RGB", (20, 16), (1, 2, 3)).save(tmp_path / "vision\\00.png")
-    odd = [{**row, "vision": row["vision"].replace("/", "\\"), "left": f"~/{row['left']}"} for row in rows]
-    plain, read = (
-        packed(config(write(table, tmp_path / f"{name}.csv")), tmp_path / name)
-        for name, table in (("plain", rows), ("odd", odd))
-    )
-    assert np.array_equal(plain.images["vision"][1:], read.images["vision"][1:])
-    assert np.array_equal(plain.images["touch"], read.images["touch"])
-    assert (read.images["vision"][0] == (1, 2, 3)).all()
-    lost = write([{**row, "vision": "C:\\pictures\\1.png"} for row in rows], tmp_path / "lost.csv")
-    with pytest.raises(ValueError, match=r"row 1 vision C:.*; C:\\\.\.\. is on another computer\)"):
-        config(lost).source()
 
 
 def test_commands_say_what_a_group_is(tmp_path: Path, rows: Table, capsys: pytest.CaptureFixture[str]) -> None:

@@ -170,16 +170,6 @@ def test_something_else_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "holds no " in error and "git clone https://github.com/" in error and error.count("\n") == 1
 
 
-def test_the_command(clones: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    place = clones / "slip_grasp"
-    common = f"data pack --data slip_grasp --path {place} --quiet --size 16 --workers 1".split()
-    assert main([*common, "--split", "fold3", "--only", "seq<=4", "--out", str(tmp_path / "p")]) == 0
-    pack = Pack(tmp_path / "p")
-    assert pack.num == 14 * 5
-    assert set(pack.column("fold3")[pack.rows("test")]) == {"test"}
-    assert len(set(pack.column("group")[pack.rows("test")])) == 1
-
-
 def test_every_group_is_tested_once() -> None:
     groups = [f"g{i % 17}" for i in range(100)]
     strata = [f"s{i % 17 % 3}" for i in range(100)]
@@ -238,17 +228,6 @@ def test_slip_grasp_pairs_by_frame(packs: dict[str, Pack]) -> None:
     assert pack.spec.controls["width"] == ("width_mm",)
 
 
-@pytest.mark.parametrize("line", ["68 fail 0 160", "68 fail ? 160 450 398 068_00 _s09_"])
-def test_slip_grasp_names_a_bad_line(tmp_path: Path, line: str) -> None:
-    make_slip_grasp(tmp_path)
-    (tmp_path / "data/object002_result.dat").write_text(f"\n{line}\n")
-    with pytest.raises(ValueError, match=r"object002_result\.dat line 2: .* is not a grasp"):
-        SlipGraspConfig(path=tmp_path).source()
-    (tmp_path / "data/object002_result.dat").write_text("9 ok 1 1 3 2 009_00 _s09_")
-    with pytest.raises(ValueError, match=r"no images in object002/009_00_mm"):
-        SlipGraspConfig(path=tmp_path).source()
-
-
 def test_slip_gsmini_counts_copies_once(packs: dict[str, Pack]) -> None:
     pack = packs["slip_gsmini"]
     assert pack.num == 9 * 2 * 12
@@ -303,9 +282,6 @@ def test_physiclear_newer_layout_and_missing_labels(clones: Path, tmp_path: Path
     file = tmp_path / "new/src/utils/constants.py"
     file.write_text(file.read_text().replace("TEXTURE_RANK", "OTHER"))
     with pytest.raises(ValueError, match="does not define TEXTURE_RANK"):
-        PhysiclearConfig(path=tmp_path / "new").source()
-    file.unlink()
-    with pytest.raises(ValueError, match=r"has no utils/constants\.py"):
         PhysiclearConfig(path=tmp_path / "new").source()
 
 

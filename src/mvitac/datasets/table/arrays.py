@@ -30,6 +30,7 @@ MAX_TEXT = 200
 """Characters of the longest attribute that is a column. robomimic keeps whole simulator files in attributes."""
 MAGIC = (b"\xff\xd8", b"\x89P")  # first bytes of a JPEG and of a PNG
 Refs = dict[str, list[ImageRef | None]]
+LeftOut = dict[str, str]  # name of what is no column -> why
 
 
 def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vectors: Collection[str]) -> Manifest:
@@ -41,7 +42,7 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
     """
     rows: list[dict[str, str]] = []
     found: Refs = {}
-    left_out: dict[str, str] = {}
+    left_out: LeftOut = {}
     seen = ""
     for file in files:
         with open_arrays(file) as opened:
@@ -99,9 +100,7 @@ def _episodes(demo: str, ends: Any, num: int) -> list[tuple[str, int]]:
         raise ValueError(f"{demo}: meta/episode_ends does not rise to {num}, the number of images")
     number = np.searchsorted(last, np.arange(num), side="right")
     starts = np.r_[0, last][number]
-    return [
-        (f"{demo}/{k}", i - start) for i, (k, start) in enumerate(zip(number.tolist(), starts.tolist(), strict=True))
-    ]
+    return [(f"{demo}/{k}", i - int(start)) for i, (k, start) in enumerate(zip(number, starts, strict=True))]
 
 
 def _holds_images(data: Any) -> bool:
@@ -123,10 +122,8 @@ def _seen(datasets: dict[str, Any]) -> str:
 
 
 def _no_images(where: Path, names: Collection[str], seen: str) -> ValueError:
-    return ValueError(
-        f"{where} has no image dataset {' or '.join(map(repr, names))} (it has {seen or 'none'}): name images by their"
-        " path below the demonstration, --data.vision obs/camera --data.touch obs/gel"
-    )
+    lacks = f"{where} has no image dataset {' or '.join(map(repr, names))} (it has {seen or 'none'})"
+    return ValueError(f"{lacks}: give their paths below the demonstration, --data.vision obs/camera")
 
 
 def _images(file: Path, name: str, datasets: dict[str, Any], images: Collection[str], most: int) -> Refs:
@@ -135,10 +132,8 @@ def _images(file: Path, name: str, datasets: dict[str, Any], images: Collection[
     for data in shown.values():
         numbers = data.ndim == 4 and data.dtype.kind in "uif" and data.shape[3] in (1, 2, 3) and 0 not in data.shape[1:]
         if not numbers and not (data.ndim < 4 and _holds_images(data)):
-            raise ValueError(
-                f"{file}: {data.name} is {data.dtype} {list(data.shape)}: images must be [rows, height, width, 3] as uint8,"
-                " or with 1 or 2 channels, or JPEG or PNG files"
-            )
+            need = "images are [rows, height, width, 1 to 3] or JPEG or PNG files"
+            raise ValueError(f"{file}: {data.name} is {data.dtype} {list(data.shape)}: {need}")
         if numbers and (pixels := data.shape[1] * data.shape[2]) > MAX_PIXELS:
             raise ValueError(f"{file}: images of {data.name} have {pixels:,} pixels: at most {MAX_PIXELS:,} are read")
     (first, num), *others = ((data.name, data.shape[0]) for data in shown.values())
@@ -151,12 +146,7 @@ def _images(file: Path, name: str, datasets: dict[str, Any], images: Collection[
 
 
 def _columns(
-    demo: str,
-    datasets: dict[str, Any],
-    num: int,
-    skip: Collection[str],
-    vectors: Collection[str],
-    left_out: dict[str, str],
+    demo: str, datasets: dict[str, Any], num: int, skip: Collection[str], vectors: Collection[str], left_out: LeftOut
 ) -> dict[str, list[str]]:
     """Return the texts of the datasets that are columns: one per row, or one for all; others go to ``left_out``."""
     cells: dict[str, list[str]] = {}
@@ -164,12 +154,10 @@ def _columns(
         if name in skip:
             continue
         text = data.dtype.kind in "UT" or _is_text(data)
-        if data.ndim and data.shape[0] != num:
-            left_out.setdefault(name, f"has {data.shape[0]} rows in {demo}, the images have {num}: they must be equal")
-        elif data.ndim > 2 or (data.dtype.kind not in "biuf" and not text):
-            left_out.setdefault(name, f"is {data.dtype} {list(data.shape)}: a column needs a number or a text per row")
-        elif data.ndim == 2 and data.shape[1] != 1 and name not in vectors:
-            left_out.setdefault(name, f"has {data.shape[1]} numbers per row: name one of them, as in {name}[0]")
+        many = data.ndim > 2 or (data.ndim == 2 and data.shape[1] != 1 and name not in vectors)
+        if many or (data.ndim and data.shape[0] != num) or (data.dtype.kind not in "biuf" and not text):
+            needs = f"a column has a number or a text for each of the {num} images; of lists one is named, {name}[0]"
+            left_out.setdefault(name, f"is {data.dtype} {list(data.shape)} in {demo}: {needs}")
         elif data.size > MAX_NUMBERS:
             left_out.setdefault(name, f"has {data.size:,} numbers: a column has at most {MAX_NUMBERS:,}")
         else:
@@ -195,7 +183,7 @@ def _at(opened: Any, name: str) -> Any:
     return opened[name] if name else opened
 
 
-def _constants(opened: Any, name: str, vectors: Collection[str], left_out: dict[str, str]) -> dict[str, list[str]]:
+def _constants(opened: Any, name: str, vectors: Collection[str], left_out: LeftOut) -> dict[str, list[str]]:
     """Return the attributes of group ``name`` and of those above it; the nearest counts."""
     cells: dict[str, list[str]] = {}
     parts = name.split("/") if name else []
@@ -204,14 +192,10 @@ def _constants(opened: Any, name: str, vectors: Collection[str], left_out: dict[
             plain = np.asarray(value).tolist()
             plain = plain[0] if isinstance(plain, list) and len(plain) == 1 else plain
             plain = plain.decode() if isinstance(plain, bytes) else plain
-            if isinstance(plain, str) and len(plain) > MAX_TEXT:
-                left_out.setdefault(
-                    column, f"is an attribute of {len(plain)} characters: a column has at most {MAX_TEXT}"
-                )
-            elif isinstance(plain, list) and column not in vectors:
-                left_out.setdefault(
-                    column, f"is an attribute of {len(plain)} values: name one of them, as in {column}[0]"
-                )
+            long = isinstance(plain, str) and len(plain) > MAX_TEXT
+            if long or (isinstance(plain, list) and column not in vectors):
+                most = f"at most {MAX_TEXT} characters, or one value; of several one is named, {column}[0]"
+                left_out.setdefault(column, f"is an attribute of {len(plain)} parts: a column has {most}")
             elif isinstance(plain, (str, int, float, list)):
                 cells[column] = [text_of(plain)]
     return cells

@@ -85,15 +85,9 @@ def join(
 ) -> Manifest:
     """Return the rows of ``table`` with the columns of ``logs`` at their time, and a note about each log.
 
-    Rows without a measurement within ``tolerance`` seconds are left out; nothing is extrapolated.
-
-    Args:
-        table: Rows with a time: a column, or frames of videos.
-        logs: ``FILE:COLUMN``, as above.
-        images: Names that columns of images may have, the most important first.
-        numbers: Columns that are interpolated if ``linear``; then both neighbours must be near enough. Others are nearest.
-        tolerance: Largest distance in seconds.
-        linear: Whether numbers are interpolated.
+    Rows without a measurement within ``tolerance`` seconds are left out; nothing is extrapolated. ``images``: names that
+    columns of images may have, the most important first. ``numbers`` are interpolated if ``linear``; then both neighbours
+    must be near enough. Others are nearest.
     """
     shown = next((column for column in images if column in table.columns), None)
     refs: list[ImageRef | None] = table.refs(shown) if shown else [None] * len(table.rows)
@@ -110,10 +104,8 @@ def join(
             cells, largest = joined(log, stamps, times[at], (numbers if linear else ()), tolerance)
             gap = max(gap, largest)
             if not any(cells):
-                spans = [f"{np.nanmin(t):.3f} to {np.nanmax(t):.3f} s" for t in (times[at], stamps)]
-                raise ValueError(
-                    f"{file} has no time of the images, {spans[0]}, but {spans[1]}: {text}+SECONDS shifts it"
-                )
+                own, theirs = (f"{np.nanmin(t):.3f} to {np.nanmax(t):.3f} s" for t in (stamps, times[at]))
+                raise ValueError(f"{file} has no time of the images, {theirs}, but {own}: {text}+SECONDS shifts it")
             for i, row in zip(at, cells, strict=True):
                 made[i] = {c: cell for c, cell in row.items() if c != column}
                 for c in [c for c in images if made[i].get(c)]:
@@ -123,9 +115,8 @@ def join(
             raise ValueError(f"{table.path} and {name} both have a column {min(twice)!r}: rename one")
         there = [bool(row) for row in made]
         lost = f"; {there.count(False)} of {len(there)} rows are not within {tolerance:g} s of it and left out"
-        note = (
-            f"{name} joined by {text.removeprefix(f'{name}:')}, its largest gap is {gap:.3g} s{lost * (not all(there))}"
-        )
+        note = f"{name} joined by {text.removeprefix(f'{name}:')}, its largest gap is {gap:.3g} s"
+        note += lost * (not all(there))
         rows = [{**row, **{c: more.get(c, "") for c in names}} for row, more in zip(table.rows, made, strict=True)]
         table = replace(table, rows=rows, digest=digest([table.digest, made]), notes=(*table.notes, note))
         table = table.kept(there, "")
@@ -157,10 +148,8 @@ def _check_apart(file: Path, times: np.ndarray, recordings: Sequence[str]) -> No
     """Raise ValueError if recordings that each begin at 0 s share the log ``file``, whose values fit only one of them."""
     names = np.array(recordings)[np.argsort(times, kind="stable")]
     if np.nanmax(times, initial=0) < 1e9 and (names[1:] != names[:-1]).sum() >= len({*recordings}):
-        raise ValueError(
-            f"{file} would be the log of {len({*recordings})} recordings at the same times: give each its own, beside"
-            " its video, or stamps since 1970"
-        )
+        what = f"{file} would be the log of {len({*recordings})} recordings at the same times"
+        raise ValueError(f"{what}: give each its own, beside its video, or stamps since 1970")
 
 
 def joined(

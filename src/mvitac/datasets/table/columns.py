@@ -54,10 +54,8 @@ def read_task(table: Manifest, column: str, counts: Sequence[bool]) -> tuple[Tas
         what = f"only the class {min(names)!r}" if names else "no labels"
         raise ValueError(f"{table.path}: column {column!r} has {what} in {len(cells)} rows: a task needs two")
     if len(names) == labelled >= 10:
-        raise ValueError(
-            f"{table.path}: column {column!r} has another value in each of its {labelled} rows: a measurement is named"
-            f" with --values {column}:UNIT"
-        )
+        hint = f"a measurement is --values {column}:UNIT"
+        raise ValueError(f"{table.path}: column {column!r} has another value in each of its {labelled} rows: {hint}")
     numbers = all(number_of(name) is not None for name in names)
     classes = sorted(names, key=lambda name: (float(name), name)) if numbers else sorted(names)
     labels = {name: i for i, name in enumerate(classes)}
@@ -112,9 +110,7 @@ def read_values(
             if counted and (cell := row[target.name]):
                 value = number_of(cell)
                 if value is None:
-                    raise ValueError(
-                        f"{table.at(i)}: {target.name} is {cell!r}: give a finite number in {target.unit}, or nothing"
-                    )
+                    raise ValueError(f"{table.at(i)}: {target.name} is {cell!r}: give a finite number, or nothing")
                 columns[target.name][i] = value
     for name, found in columns.items():
         if len({value for value in found if value == value}) < 2:  # NaN differs from itself
@@ -154,9 +150,7 @@ def _numeric(table: Manifest, column: str, labelled: Sequence[bool]) -> dict[str
         return {column: [value or 0.0 for value in values]}  # an empty cell is unlabelled, so never probed: any number
     names = sorted({cell for cell in cells if cell})
     if len(names) > MAX_ONE_HOT:
-        raise ValueError(
-            f"{table.path}: control column {column!r} has {len(names)} texts, e.g. {names[0]!r}: at most {MAX_ONE_HOT}"
-        )
+        raise ValueError(f"{table.path}: control column {column!r} has {len(names)} texts: at most {MAX_ONE_HOT}")
     return {f"{column}={name}": [float(cell == name) for cell in cells] for name in names}
 
 

@@ -1,7 +1,6 @@
 """Finds and checks the images that a table's rows refer to, and the background of each touch image."""
 
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,10 +26,8 @@ def find(table: Manifest, vision: str | None, touch: tuple[str, ...]) -> tuple[s
     if vision in touch:
         raise ValueError(f"column {vision!r} would be both vision and touch: vision='' if there is no camera")
     if not (vision or touch):
-        raise ValueError(
-            f"{table.path} has no column vision, touch, or left and right (it has {', '.join(have)}):"
-            " name the image columns, --data.vision COLUMN --data.touch COLUMN"
-        )
+        hint = f"name the image columns, --data.vision COLUMN --data.touch COLUMN, of {', '.join(have)}"
+        raise ValueError(f"{table.path} has no column vision, touch, or left and right: {hint}")
     return vision, touch
 
 
@@ -77,11 +74,9 @@ def check_present(
         gaps = [[table.images[c][i] is None for c in columns] for i in range(len(table.rows))]
         for i, gap in enumerate(gaps):
             if any(gap) and not (allow_missing and all(gap)):
-                hint = "--data.allow-missing accepts rows without a modality"
-                hint = hint if all(gap) else "stacked sensors need both images"
+                hint = "--data.allow-missing accepts such rows" if all(gap) else "stacked sensors need both images"
                 raise ValueError(
-                    f"{table.at(i)} has no {columns[gap.index(True)]} path: fill it, or leave the row out"
-                    f" (--data.only); {hint}"
+                    f"{table.at(i)} has no {columns[gap.index(True)]} path: {hint}, --data.only leaves it out"
                 )
         lacking = [bool(gap) and all(gap) for gap in gaps]
         if all(lacking) and columns:
@@ -119,10 +114,6 @@ def check_files(
                 name = table.rows[i].get(column) or os.path.basename(ref.path)
                 missing.append(f"row {number} {column} {name}{' (0 bytes)' if sizes[-1] == 0 else ''}")
     if missing:
-        tried = "; backslashes were also tried as slashes" if "\\" in missing[0] else ""
-        tried = "; C:\\... is on another computer" if re.search(r" [A-Za-z]:\\", missing[0]) else tried
-        raise ValueError(
-            f"{table.path}: {len(missing)} of {len(sizes)} image files are missing or empty, e.g."
-            f" {'; '.join(missing[:3])} (paths are relative to {table.root}{tried})"
-        )
+        few = f"{len(missing)} of {len(sizes)} image files are missing or empty, e.g. {'; '.join(missing[:3])}"
+        raise ValueError(f"{table.path}: {few} (paths are relative to {table.root})")
     return sizes, stamps

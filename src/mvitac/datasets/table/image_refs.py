@@ -193,9 +193,7 @@ def open_arrays(path: str | Path) -> Iterator[Any]:
         raise ValueError(f"{path} needs zarr: pip install 'mvitac[zarr]'") from None
     except (OSError, KeyError, RuntimeError, TypeError, UnicodeDecodeError, BadZipFile) as error:
         what = "HDF5" if hdf5 else "zarr"
-        raise ValueError(
-            f"{path} cannot be read as {what} ({brief(error)}): is it complete, and closed by the program that wrote it?"
-        ) from None
+        raise ValueError(f"{path} cannot be read as {what} ({brief(error)}): is it complete, and closed?") from None
 
 
 @dataclass(frozen=True, slots=True, order=True)

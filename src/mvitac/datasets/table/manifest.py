@@ -59,11 +59,7 @@ class Manifest:
     ) -> "Manifest":
         """Return the table of ``rows`` that a reader made from ``path``; cells that a row lacks are empty.
 
-        Args:
-            path: What was read.
-            rows: Column -> text, for each row. ``text_of`` makes texts of other values.
-            images: Image column -> reference per row, or None; other image columns hold paths.
-            known: Other fields.
+        ``text_of`` makes texts of other values. ``images`` and ``known`` are other fields of the table.
         """
         if not rows:
             raise ValueError(f"{path} holds no rows: is it the right one, and whole?")
@@ -142,7 +138,7 @@ class Manifest:
         counter = f"{column}_frame" if f"{column}_frame" in self.columns else "frame"
         for i, row in enumerate(self.rows):
             cell, number = row[column], row.get(counter, "")
-            path = _find(root, cell)
+            path = os.path.join(root, cell)
             if not cell:
                 refs.append(None)
             elif not cell.lower().endswith(VIDEOS):
@@ -152,17 +148,6 @@ class Manifest:
             else:
                 raise ValueError(f"{self.at(i)}: {cell} is a video, {counter} {number!r}: give the frame, from 0")
         return refs
-
-
-def _find(root: str, cell: str) -> str:
-    """The path that ``cell`` means: relative to ``root``, ``~`` as the home folder, and Windows' backslashes as slashes.
-
-    A file that has exactly this name is preferred.
-    """
-    path = os.path.join(root, cell)
-    if ("\\" in cell or cell.startswith("~")) and not os.path.lexists(path):
-        return os.path.join(root, os.path.expanduser(cell.replace("\\", "/")))
-    return path
 
 
 def text_of(value: Any) -> str:

@@ -80,8 +80,7 @@ def _sample(row: Row, vision: Loaded, touch: Sequence[Loaded], size: int, lost: 
             raise ValueError(lost[ref])
     touches = [images[ref] for images, ref in zip(touch, row.touch, strict=False)]
     if len({shape for shape, _ in touches}) > 1:
-        (h, w), (h2, w2) = (shape for shape, _ in touches)
-        raise ValueError(f"{row.touch[0]} is {w} x {h}, {row.touch[1]} is {w2} x {h2}: stacked sensors need one size")
+        raise ValueError(f"{row.touch[0]} and {row.touch[1]} differ in size: stacked sensors need one")
     pressed = [image for _, image in touches]
     for k, background in enumerate(row.background):
         empty, shape = mean_image(background), touches[k][0]

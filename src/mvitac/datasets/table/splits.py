@@ -7,10 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mvitac.data.pack_table import SPLITS
 from mvitac.data.spec import AnyTask
 from mvitac.datasets.table.image_refs import Frame, ImageRef
-from mvitac.registry import unknown
 
 BY_GROUP = "by-group"
 
@@ -74,13 +72,6 @@ def _root(parent: dict[str, str], name: str) -> str:
     return name
 
 
-def check_split_names(where: str, column: str, numbers: Sequence[int], splits: Sequence[str]) -> None:
-    for number, split in zip(numbers, splits, strict=True):
-        if split not in SPLITS:
-            hint = f"or --data.split {BY_GROUP} ignores the column"
-            raise ValueError(f"{where} row {number}: {unknown(f'split in column {column!r}', split, SPLITS)}; {hint}")
-
-
 def check_leak(where: str, split: str, what: str, values: Sequence[str], splits: Sequence[str]) -> None:
     """Raise ValueError if a value occurs in more than one split.
 
@@ -91,13 +82,10 @@ def check_leak(where: str, split: str, what: str, values: Sequence[str], splits:
         sides[value].add("train" if side == "unlabelled" else side)
     leaks = [value for value, found in sides.items() if len(found) > 1]
     if leaks:
-        advice = f"--data.split {BY_GROUP} assigns whole groups"
-        if split == BY_GROUP:
-            advice = "give the group that holds them together (--data.group)"
-        raise ValueError(
-            f"{where}: split {split!r} leaks: {len(leaks)} of {len(sides)} {what} are in more than one split, e.g."
-            f" {leaks[0]!r} in {' and '.join(sorted(sides[leaks[0]]))}; {advice}, or --data.allow-leak accepts it"
-        )
+        found = f"{leaks[0]!r} in {' and '.join(sorted(sides[leaks[0]]))}"
+        told = f"{len(leaks)} of {len(sides)} {what} are in more than one split, e.g. {found}"
+        advice = "give the group" if split == BY_GROUP else f"--data.split {BY_GROUP} assigns whole groups"
+        raise ValueError(f"{where}: split {split!r} leaks: {told}; {advice}, or --data.allow-leak accepts it")
 
 
 def check_sides(
@@ -111,9 +99,9 @@ def check_sides(
     for task, target in zip(tasks, targets, strict=True):
         for side in ("train", "test"):
             if not any(label >= 0 and s == side for label, s in zip(target, splits, strict=True)):
-                more = "give more groups (--data.group COLUMN), or another --data.test-share"
-                hint = more if split == BY_GROUP else "a probe needs train and test"
-                raise ValueError(f"{where}: {what} gives label {task.name!r} no labelled rows in {side}: {hint}")
+                raise ValueError(
+                    f"{where}: {what} gives label {task.name!r} no labelled rows in {side}: give more groups"
+                )
 
 
 def folds(groups: Sequence[str], strata: Sequence[str], num: int, val_every: int = 2) -> dict[str, list[str]]:

@@ -7,7 +7,6 @@ import math
 import os
 import re
 from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from mvitac.data.pack_table import SPLITS
 from mvitac.data.source import Lost, Sample, Source, one_stamp
 from mvitac.data.spec import AnyTask, DataSpec
 from mvitac.datasets.base import KEEPING, DatasetConfig
@@ -25,7 +25,7 @@ from mvitac.datasets.table.image_refs import span_of
 from mvitac.datasets.table.manifest import Manifest, number_of
 from mvitac.datasets.table.read_rows import Row, bundles, read_rows
 from mvitac.datasets.table.splits import BY_GROUP
-from mvitac.registry import check_range, to_json
+from mvitac.registry import check_range, to_json, unknown
 from mvitac.system.files import digest
 
 VERSION = 3  # version of this reader. Increase it when the same table would give another pack.
@@ -125,12 +125,7 @@ class RowsConfig(DatasetConfig, ABC):
             raise ValueError(f"touch {' '.join(self.touch)}: give one column, or two to stack (left right)")
         for name in self.control_columns():
             if name in CONTROL_NAMES:
-                raise ValueError(
-                    f"control {name!r} is always computed: choose a name not among {', '.join(CONTROL_NAMES)}"
-                )
-        names = Counter([*self.labels, *(value_task(text).name for text in self.values)])
-        if twice := [name for name, times in names.items() if times > 1]:
-            raise ValueError(f"task {twice[0]!r} occurs twice: give each task its own name, --values NAME=column:unit")
+                raise ValueError(f"control {name!r} is always computed: choose another name")
 
     def control_columns(self) -> dict[str, tuple[str, ...]]:
         """Return control name -> manifest columns."""
@@ -172,13 +167,6 @@ class RowsConfig(DatasetConfig, ABC):
     def source(self) -> Source:
         return Rows(self)
 
-    def unused(self) -> tuple[str, ...]:
-        """Options without effect, which are not part of what identifies a pack."""
-        return (
-            *(() if self.log else ("log", "tolerance", "interpolate")),
-            *(name for name in ("crop", "range", "bgr") if not getattr(self, name)),
-        )
-
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedConfig(RowsConfig, ABC):
@@ -192,9 +180,6 @@ class RecordedConfig(RowsConfig, ABC):
         super().__post_init__()
         if self.every is not None:
             check_range(self, 1, math.inf, "every")
-
-    def unused(self) -> tuple[str, ...]:
-        return (*super().unused(), *(("every",) * (self.every is None)))
 
 
 class Rows(Source):
@@ -239,7 +224,8 @@ class Rows(Source):
         own |= values | {f"has_{m}": [not lacks for lacks in lacking] for m, lacking in missing.items()}
         self._rows = self._make_rows(table, grounds, own, extra)
 
-        self._items = bundles(self._rows, max(1, min(MAX_TOGETHER, MAX_TOGETHER_BYTES // self._row_bytes())))
+        row_bytes = 3 * config.size**2 * len(self._images)
+        self._items = bundles(self._rows, max(1, min(MAX_TOGETHER, MAX_TOGETHER_BYTES // row_bytes)))
         used = [[ref for i in item for ref in self._rows[i].refs()] for item in self._items]
         self._stamps = [one_stamp((*stamps[ref.path], *ref.within()) for ref in refs) for refs in used]
         self._spec = DataSpec(
@@ -271,9 +257,6 @@ class Rows(Source):
         images = [name for name in (*config.touch, config.vision, *names) if name]
         how: Any = {"tolerance": config.tolerance, "linear": config.interpolate == "linear"}
         return clocks.join(table, config.log, images, numbers=config.numbers(), **how) if config.log else table
-
-    def _row_bytes(self) -> int:
-        return 3 * self._config.size**2 * len(self._images)
 
     def _select(self, table: Manifest) -> tuple[Manifest, list[Background]]:
         """Return the rows that become samples with their images, and the background of each (none for raw images)."""
@@ -319,7 +302,9 @@ class Rows(Source):
             found = splits.assign_splits(groups, labels, config.test_share, config.val_share, config.split_seed)
         else:
             found = table.filled(column, "split")
-            splits.check_split_names(where, column, table.numbers, found)
+            for number, split in zip(table.numbers, found, strict=True):
+                if split not in SPLITS:
+                    raise ValueError(f"{where} row {number}: {unknown(f'split in column {column!r}', split, SPLITS)}")
         if not config.allow_leak:
             for what, names in whole.items():
                 splits.check_leak(where, column, what, names, found)
@@ -380,13 +365,12 @@ class Rows(Source):
         return [len(item) for item in self._items]
 
     def fingerprint(self) -> dict[str, Any]:
-        unused = ("path", *KEEPING, *self._config.unused())
         return {
             "reader": f"{self._config.name} {VERSION}",
             "title": self._title,
             "manifest": self._digest,
             "file_sizes": digest(self._sizes),
-            "options": {k: v for k, v in to_json(self._config).items() if k not in unused},
+            "options": {k: v for k, v in to_json(self._config).items() if k not in ("path", *KEEPING)},
         }
 
     def stamps(self) -> list[int]:
