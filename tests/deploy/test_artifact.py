@@ -17,9 +17,8 @@ from mvitac.data.pack import Pack
 from mvitac.deploy.artifact import ARTIFACT, preprocessing
 from mvitac.deploy.card import card
 from mvitac.deploy.publish import fit_probes, push
-from mvitac.deploy.search import check_pack
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
-from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.features import fitting, pack_features
 from mvitac.evaluation.probe import split_rows
 from mvitac.system.files import digest_file
 
@@ -74,17 +73,17 @@ def test_the_card_names_what_encoders_and_what_probes_learned_from(artifact: Pat
 def test_difference_images_are_told(smoke_run: Path, pack: Pack, tmp_path: Path) -> None:
     """By model and card; raw packs are not taken for them."""
     model = mvitac.load(smoke_run)
-    assert preprocessing(model)["background"].startswith("none is subtracted") and check_pack(model, pack)
+    assert preprocessing(model)["background"].startswith("none is subtracted") and fitting(model, pack)
     model.spec = replace(model.spec, difference=True)
     model.save(tmp_path / "model.safetensors")
     found = mvitac.load(tmp_path / "model.safetensors")
     given = preprocessing(found)
     assert found.spec.difference and given["difference"] and given["background"].startswith("subtracted: touch is")
     with pytest.raises(ValueError, match="the model was trained on difference images"):
-        check_pack(found, pack)
+        fitting(found, pack)
     minus = copied(pack)
     minus.spec = replace(pack.spec, difference=True)
-    assert check_pack(found, minus) == ("vision", "touch")
+    assert fitting(found, minus) == ("vision", "touch")
 
 
 def test_predict_subtracts_the_background(copy: Path, pack: Pack) -> None:

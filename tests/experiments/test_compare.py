@@ -207,7 +207,7 @@ def test_changed_fields_are_checked() -> None:
     assert changed(run, {"data.num_frames": 4}).data.num_frames == 4  # not written to files at its default
     assert changed(run, {}) == run
     for name in ("optim.lrr", "steps.more", "nothing", "method.name", "optim"):
-        with pytest.raises(ValueError, match=r"optim|steps|nothing|method"):
+        with pytest.raises(ValueError, match=name.split(".")[-1]):
             changed(run, {name: 3})
     with pytest.raises(ValueError, match="expected int"):
         changed(run, {"steps": "many"})
@@ -596,7 +596,7 @@ def test_the_command_from_dry_run_to_tables(pack: Pack, tmp_path: Path, capsys: 
         (["--plan", "tabel1"], "did you mean 'table1'"),
         (["--recipe", "quikc"], "did you mean 'quick'"),
         (["--set", "steps"], "field=value"),
-        (["--set", "stepz=3"], "unknown field of a run 'stepz'"),
+        (["--set", "stepz=3"], "unknown field in run 'stepz'"),
         (["--jobs", "0"], "jobs 0"),
         (["--rows", "SVTP"], "unknown row 'SVTP'"),
         (["--seeds", "0"], "seeds 0"),
@@ -672,7 +672,6 @@ def test_folds_are_run_apart_and_pooled(two_folds: Path, tmp_path: Path, capsys:
     assert one["group_correct"] == apart[0]["group_correct"] + apart[1]["group_correct"]
     assert one["accuracy"] == pytest.approx((apart[0]["accuracy"] + apart[1]["accuracy"]) / 2)
     assert one["auroc"] == pytest.approx((apart[0]["auroc"] + apart[1]["auroc"]) / 2)
-    assert "| AUROC % | modality | label |" in (out / "table.md").read_text()
     (out / "fold2/runs/simclr/seed1/scores.json").unlink()
     (out / "fold2/runs/simclr/seed1/model.safetensors").unlink()
     main(["compare", "--plan", str(two_folds), "--out", str(out), "--tables-only"])
@@ -690,7 +689,7 @@ def test_folds_are_run_apart_and_pooled(two_folds: Path, tmp_path: Path, capsys:
         (["split=fold1", "split=Fold1"], "do not tell them apart"),
         (["split=_"], "do not tell them apart"),
         (["fold1"], "fold fold1: give field=value, e.g. split=fold1"),
-        (["splits=fold1"], "unknown field of a run 'data.splits'"),
+        (["splits=fold1"], "unknown field in run.data 'splits'"),
     ],
 )
 def test_folds_that_cannot_be(

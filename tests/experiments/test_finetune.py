@@ -253,7 +253,7 @@ def test_bad_input_is_refused_before_anything_is_written(
     )
     refuse(capsys, command(few, "--labels", "pattern"), "too few to hold some out", "give one --lr and one --steps")
     six = toy_pack(tmp_path / "six", touch_channels=6)
-    refuse(capsys, command(six.path), "cannot embed this data's touch (6 channels)")
+    refuse(capsys, command(six.path), "has 6 channels of touch")
     seen = edited(
         pack, tmp_path / "seen", split=lambda row: {"test": "train", "train": "test"}.get(row["split"], row["split"])
     )
@@ -389,7 +389,7 @@ def test_bad_input_of_adapt(ancestor: Path, pack: Pack, tmp_path: Path, capsys: 
         return ["adapt", str(ancestor), "--data", "pack", "--data.path", str(path), "--out", str(out), *more]
 
     six = toy_pack(tmp_path / "six", touch_channels=6)
-    refuse(capsys, command(six.path), "cannot embed this data's touch (6 channels)")
+    refuse(capsys, command(six.path), "has 6 channels of touch")
     single = toy_pack(tmp_path / "single", vision_channels=0)
     refuse(capsys, command(single.path), "trained with vision, which the data lacks")
     refuse(capsys, command(pack.path, "--steps", "0"), "steps 0: give at least 1")

@@ -10,7 +10,7 @@ import tyro
 from tabulate import tabulate
 from tyro.conf import Positional
 
-from mvitac.cli.options import asks_help, check_json, parse, printed_to, save_json, selectors, short
+from mvitac.cli.options import asks_help, check_json, parse, printed_to, save_json, selectors
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
@@ -56,7 +56,7 @@ def pack(argv: list[str]) -> None:
             print(f"usage: {usage}\n\nThe options of one: mvitac data pack --data NAME --help")
             return
         raise ValueError(f"name the dataset: {usage}")
-    _build(dataset(chosen["--data"]), short(rest), f"data pack --data {chosen['--data']}")
+    _build(dataset(chosen["--data"]), rest, f"data pack --data {chosen['--data']}")
 
 
 def _build(config: Any, argv: list[str], prog: str) -> None:

@@ -9,7 +9,7 @@ import tyro
 from tabulate import tabulate
 from tyro.conf import Positional
 
-from mvitac.cli.options import check_json, parse, printed_to, save_json, selectors, short
+from mvitac.cli.options import check_json, parse, printed_to, save_json, selectors
 from mvitac.data.checks.examine import Draw, examine_open, examine_pack, examine_source, nothing
 from mvitac.data.checks.finding import Finding, exit_code
 from mvitac.data.pack import Pack
@@ -43,11 +43,6 @@ class _PackOptions(_Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _WindowOptions(_Options):
-    data: Annotated[PackConfig, tyro.conf.arg(name="")] = PackConfig()
-
-
-@dataclass(frozen=True, kw_only=True)
 class _SourceOptions(_Options):
     data: Annotated[DatasetConfig, tyro.conf.arg(name="")]
     items: int = 0
@@ -67,18 +62,14 @@ def check(argv: list[str]) -> int:
             return _report(name, examine_pack(name, draw=draw_sheet), options)
         return _report(name, examine_open(open_packs(options.pack), draw=draw_sheet), options)
     name = f"--data {chosen['--data']}"
-    opened = dataset(chosen["--data"])
-    if isinstance(opened, PackConfig):
-        usual = _WindowOptions(data=opened)
-        options = parse(_WindowOptions, short(rest), f"data check {name}", default=usual, description=_MANUAL)
-        found = examine_pack(options.data.path, options.data.frame_window(), _sheet(name, options))
-        return _report(str(options.data.path), found, options)
-    usual = _SourceOptions(data=opened)
-    options = parse(_SourceOptions, short(rest), f"data check {name}", default=usual, description=_MANUAL)
+    usual = _SourceOptions(data=dataset(chosen["--data"]))
+    options = parse(_SourceOptions, rest, f"data check {name}", default=usual, description=_MANUAL)
     draw_sheet = _sheet(name, options)
     if options.items < 0:
         raise ValueError(f"--items {options.items}: give the number of items to read, 0 for all")
     data: Any = options.data
+    if isinstance(data, PackConfig):
+        return _report(str(data.path), examine_pack(data.path, data.frame_window(), draw_sheet), options)
     # A leak is a finding here, beside all the others; packing refuses it.
     source = (replace(data, allow_leak=True) if isinstance(data, RowsConfig) else data).source()
     asked: Any = {"num": options.items, "workers": data.workers, "quiet": options.quiet}

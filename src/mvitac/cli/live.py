@@ -51,8 +51,6 @@ class _Options:
     """SOURCE of the touch sensor, or of both of a gripper: left right. Without any source, all are simulated."""
     sensor: str = ""
     """Name of the touch sensor, as in column sensor of the training data: live says if the model never met it."""
-    known: Path | None = None
-    """Add the three nearest known touches of this file of mvitac embed to each prediction."""
     record: Path | None = None
     """Record the frames as a pack in this new folder, at most ten pairs a second."""
     seconds: float | None = None
@@ -79,18 +77,13 @@ def live(argv: list[str]) -> None:
     check_json(options.json)
     free = [np.array(decode(file)) for file in options.background]
     engine = _engine(options.model, options.threads)
-    nearest = None
-    if options.known:
-        from mvitac.deploy.search import Embeddings
-
-        nearest = Embeddings(options.known, engine.meta["weights"]).neighbours(engine.inputs)
     streams: Any = _streams(options, engine)
     if not (options.vision or options.touch):
         _say("no --vision, no --touch: all sensors are simulated")
     sensor = options.sensor or next((stream.origin.sensor for stream in streams.get("touch", ())), "")
     if about := about_sensor(engine, sensor):
         _say(about)
-    more: Any = {"nearest": nearest, "tell": lambda event: _say(event.text), "free": free, "always": options.always}
+    more: Any = {"tell": lambda event: _say(event.text), "free": free, "always": options.always}
     loop, recorder = Live(engine, streams, options.live, **more), None
     if options.record:  # last, for a refusal must leave no spool
         channels = {m: shape[2] for m, shape in frame_shapes(engine).items()}

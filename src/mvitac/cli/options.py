@@ -96,11 +96,6 @@ def _columns(width: str) -> Iterator[None]:
             os.environ["COLUMNS"] = old
 
 
-def short(argv: Sequence[str]) -> list[str]:
-    """``argv`` with the options of a dataset spelled as in ``data pack`` (--root), not as in pretrain (--data.root)."""
-    return [f"--{word.removeprefix('--data.')}" if word.startswith("--data.") else word for word in argv]
-
-
 def selectors(argv: list[str], names: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     """Take the options ``names`` (each with one value) out of ``argv``; return their values and the other words."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)

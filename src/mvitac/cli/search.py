@@ -10,13 +10,13 @@ from typing import Annotated, Literal
 
 import numpy as np
 import tyro
-from PIL import Image
 from tabulate import tabulate
 from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, check_models, loading, parse, printed_to, save_json
-from mvitac.data.images import decode, fit
+from mvitac.data.images import decode, fit, side_by_side
 from mvitac.data.pack import Pack
+from mvitac.report.contact_sheet import draw
 from mvitac.system.files import check_place, write_atomic
 from mvitac.system.progress import shown
 
@@ -119,7 +119,12 @@ def find(argv: list[str]) -> None:
         pack = Pack(known.pack, verify=False)
         if pack.digest != known.pack_digest:
             raise ValueError(f"{pack.path} is another pack than the one that was embedded: embed it again")
-        _draw(options.sheet, [query, *(pack.images[options.target][one["row"]] for one in found)])
+        tiles = [(pack.images[options.target][one["row"]], f"{one['cosine']:.3f} {one['id']}") for one in found]
+        blocks = [("query", [(query, "")]), ("found", tiles)]
+        sheet = draw(
+            title, [(name, [(side_by_side(fit(x, _SIDE)), text) for x, text in some]) for name, some in blocks]
+        )
+        write_atomic(options.sheet, lambda file: sheet.save(file, "PNG"))
 
 
 def _picture(files: Sequence[Path]) -> np.ndarray:
@@ -130,13 +135,3 @@ def _picture(files: Sequence[Path]) -> np.ndarray:
             (h, w), (h2, w2) = parts[0].shape[:2], part.shape[:2]
             raise ValueError(f"{files[0]} is {w} x {h}, {file} is {w2} x {h2}: stacked sensors need one size")
     return np.concatenate(parts, axis=2)
-
-
-def _draw(out: Path, images: Sequence[np.ndarray]) -> None:
-    """A PNG of images [H, W, 3 n] side by side; sensors stacked in channels are below each other."""
-    tiles = [fit(image, _SIDE) for image in images]
-    columns = [np.concatenate(np.split(tile, tile.shape[2] // 3, axis=2)) for tile in tiles]
-    height = max(len(column) for column in columns)
-    white = [np.pad(c, ((0, height - len(c)), (0, 8), (0, 0)), constant_values=255) for c in columns]
-    sheet = Image.fromarray(np.concatenate(white, axis=1))
-    write_atomic(out, lambda file: sheet.save(file, "PNG"))

@@ -7,7 +7,7 @@ from typing import Any
 import jinja2
 
 from mvitac.data.spec import listed
-from mvitac.evaluation.score_text import cell_text, columns_of, covered, pipes, score_name, sources_of, tested_on
+from mvitac.evaluation.score_text import columns_of, covered, pipes, score_name, score_rows, tested_on
 from mvitac.model import Model
 from mvitac.nn.linear_probe import ValueInfo
 from mvitac.system.files import fields_of
@@ -62,8 +62,8 @@ def _tables(model: Model, scores: dict[str, Any]) -> list[str]:
     lines = []
     for name, task in scores["summary"].items():
         columns = columns_of(task)
-        rows = [[source, *(cell_text(task, source, m) for m in columns)] for source in sources_of(task)]
-        lines += pipes([f"{name} ({tested_on(task, scores['group_by'])})", *columns], rows, words=1)
+        heads = [f"{name} ({tested_on(task, scores['group_by'])})", *columns]
+        lines += pipes(heads, score_rows(task, columns), words=1)
         probes = [probe.info for probe in model.probes.values() if probe.info.task == name]
         if infos := [info for info in probes if isinstance(info, ValueInfo)]:
             errors = [[f"{e.mae:.3g} ({e.rmse:.3g})" for e in info.errors] for info in infos]

@@ -7,7 +7,6 @@ Shapes: N rows, Q queries, D dimensions.
 """
 
 import json
-from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ import pyarrow.parquet as pq
 import torch
 
 from mvitac.data.pack import Pack
-from mvitac.evaluation.features import features
+from mvitac.evaluation.features import features, fitting
 from mvitac.model import Model
 from mvitac.registry import from_json, unknown
 from mvitac.system.files import fields_of, write_atomic
@@ -25,26 +24,12 @@ from mvitac.transforms.preprocess import ImageInput
 ABOUT = b"mvitac-embeddings"  # entry of the file's metadata: JSON
 
 
-def check_pack(model: Model, pack: Pack) -> tuple[str, ...]:
-    """The modalities that model and pack have in common; ValueError if there are none, or the images do not fit."""
-    names = tuple(m for m in pack.spec.modalities if m in model.encoders)
-    for modality in names:
-        found, wanted = pack.spec.channels(modality), model.spec.channels(modality)
-        if found != wanted:
-            raise ValueError(f"{pack.path} has {found} channels of {modality}, the model was trained with {wanted}")
-    if "touch" in names and model.spec.difference and not pack.spec.difference:
-        raise ValueError(f"{pack.path}: the model was trained on difference images: pack with --subtract-background")
-    if not names:
-        raise ValueError(f"{pack.path} has {', '.join(pack.spec.modalities)}, the model {', '.join(model.encoders)}")
-    return names
-
-
 def embed(model: Model, pack: Pack, file: Path, *, shared: bool = False) -> pa.Table:
     """Write the embeddings of a pack: features, or unit vectors of the ``shared`` space."""
     rows = np.arange(pack.num)
     names = ["id", "group", "split", *(f"label_{task.name}" for task in pack.spec.tasks)]
     table = pack.table.select(names).append_column("row", pa.array(rows, pa.int64()))
-    for modality in check_pack(model, pack):
+    for modality in fitting(model, pack):
         have = pack.has(modality)[rows]
         x = features(model, pack, modality, rows[have], for_heads=shared)
         if shared:
@@ -102,20 +87,6 @@ class Embeddings:
             raise ValueError(f"{self.file} holds features, where {source} finds no {target}: embed with --shared")
         x = model.embed(**{source: images}, background=background, shared=self.shared)[source]
         return nearest(self.banks[target], unit(x.cpu().numpy()), k)
-
-    def neighbours(self, inputs: Iterable[str], k: int = 3) -> Callable[[dict[str, np.ndarray]], list[str]]:
-        """A function from an engine's outputs to "id (label, ...)" of the ``k`` nearest known touches.
-
-        Compared by touch, or by vision where the engine's ``inputs`` have no touch.
-        """
-        modality = "touch" if "touch" in inputs else "vision"
-        bank, key = self.banks[modality], f"{'shared' if self.shared else 'embedding'}_{modality}"
-
-        def find(outputs: dict[str, np.ndarray]) -> list[str]:
-            rows, _ = nearest(bank, unit(outputs[key]), k)
-            return [f"{self.table.column('id')[r]} ({', '.join(self.labels(r).values())})" for r in rows[0].tolist()]
-
-        return find
 
     def labels(self, row: int) -> dict[str, str]:
         """Class names of one row by task, where it has a label."""

@@ -16,13 +16,14 @@ from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.controls import Records, controls_of, frozen_trunks
 from mvitac.evaluation.encoders import Bound, open_encoders, probe_encoders
+from mvitac.evaluation.features import fitting
 from mvitac.evaluation.folds import fold_splits
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
 from mvitac.evaluation.probe import PROBES, probe_model, probes_of, seen_by, split_rows
 from mvitac.evaluation.probe_config import ProbeConfig
 from mvitac.evaluation.retrieval import cross_modal, retrieved_rows
 from mvitac.evaluation.run_names import names_of
-from mvitac.evaluation.score_text import cell_text, columns_of, covered, score_name, sources_of, tested_on
+from mvitac.evaluation.score_text import columns_of, covered, score_name, score_rows, tested_on
 from mvitac.evaluation.scores import per_class, pool, summarise
 from mvitac.evaluation.sensors import about_new, describe_statistics
 from mvitac.model import Model
@@ -46,10 +47,9 @@ class Scores(dict[str, Any]):
     def _repr_html_(self) -> str:
         parts = []
         for name, task in self["summary"].items():
-            columns = columns_of(task)
-            rows = [(source, *(cell_text(task, source, m) for m in columns)) for source in sources_of(task)]
-            caption = f"<b>{escape(name)}</b>, {score_name(task)} %, {escape(tested_on(task, self['group_by']))}"
-            parts.append(f"<p>{caption}</p>{tabulate(rows, ['', *columns], tablefmt='html', disable_numparse=True)}")
+            heads = [f"{name}, {score_name(task)} %, {tested_on(task, self['group_by'])}", *columns_of(task)]
+            rows = score_rows(task, columns_of(task))
+            parts.append(tabulate(rows, heads, tablefmt="html", disable_numparse=True))
         lines = [f"95 % intervals: {covered(self['group_by'], self['records'])}."]
         lines += [*self["notes"], *(f"LEAK: {leak}" for leak in self["leaks"])]
         return "".join(parts) + "".join(f"<p>{escape(line)}</p>" for line in lines)
@@ -107,8 +107,8 @@ def probe_runs(
     names = [name + ", best" * (weights == "best") for name in names_of(paths, models)]
     pack = _common_pack(models, pack)
     tasks, modalities = chosen(pack, session)
-    for path, model in zip(paths, models, strict=True):
-        check_channels(path, model, pack, pack.spec.modalities)
+    for model in models:
+        fitting(model, pack)
     # The initial weights that an artifact names may be any file or download.
     runs = [m.run.fresh() if m.foreign else m.run for m in models]
     _check_before(runs, pack, tasks, modalities, session)
@@ -268,16 +268,6 @@ def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:
 
 def _digests(paths: Sequence[Path], weights: Which = "last") -> list[str]:
     return sorted(digest_file(weights_file(path, weights)) for path in paths)
-
-
-def check_channels(path: Path, model: Model, pack: Pack, modalities: Sequence[str]) -> None:
-    """Raise ValueError unless the ``model`` at ``path`` was trained on images like those of ``pack``."""
-    for modality in modalities:
-        if model.spec.channels(modality) != pack.spec.channels(modality):
-            learned, given = (spec.channels(modality) for spec in (model.spec, pack.spec))
-            raise ValueError(
-                f"{path} cannot embed this data's {modality} ({given} channels): it learned from {learned}"
-            )
 
 
 def check_unseen(

@@ -2,7 +2,7 @@
 
 import hashlib
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
+from mvitac.data.spec import MODALITIES
 from mvitac.model import Model
 from mvitac.system.files import cache_dir, digest, write_atomic
 from mvitac.system.malloc import keep_freed_memory
@@ -23,6 +24,20 @@ def sample(rows: np.ndarray, num: int) -> np.ndarray:
     Rows cycle through the classes, so a fixed stride would miss most of them.
     """
     return np.sort(np.random.default_rng(0).choice(rows, min(num, len(rows)), replace=False))
+
+
+def fitting(model: Model, pack: Pack, among: Sequence[str] = MODALITIES) -> tuple[str, ...]:
+    """Those ``among`` modalities that model and pack have in common; ValueError if there are none, or images do not fit."""
+    names = tuple(m for m in pack.spec.modalities if m in model.encoders and m in among)
+    for modality in names:
+        found, wanted = pack.spec.channels(modality), model.spec.channels(modality)
+        if found != wanted:
+            raise ValueError(f"{pack.path} has {found} channels of {modality}, the model was trained with {wanted}")
+    if "touch" in names and model.spec.difference and not pack.spec.difference:
+        raise ValueError(f"{pack.path}: the model was trained on difference images: pack with --subtract-background")
+    if not names:
+        raise ValueError(f"{pack.path} has {', '.join(pack.spec.modalities)}, the model {', '.join(model.encoders)}")
+    return names
 
 
 def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool = False) -> np.ndarray:

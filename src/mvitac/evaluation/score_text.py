@@ -140,9 +140,9 @@ def verdicts(task: dict[str, Any]) -> list[str]:
     return said
 
 
-def balanced_rows(task: dict[str, Any], modalities: Sequence[str]) -> list[list[str]]:
-    """Rows of source and its balanced accuracy at each of ``modalities``, of one task's summary; none of even classes."""
-    rows = []
+def score_rows(task: dict[str, Any], modalities: Sequence[str]) -> list[list[str]]:
+    """Rows of source and its score at each of ``modalities``, of one task's summary; of uneven classes balanced ones too."""
+    rows = [[source, *(cell_text(task, source, m) for m in modalities)] for source in sources_of(task)]
     for source in sources_of(task):
         cells = [task.get(m, {}).get(source) or task.get("none", {}).get(source, {}) for m in modalities]
         if any("balanced" in cell for cell in cells):

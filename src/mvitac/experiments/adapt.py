@@ -12,7 +12,8 @@ from typing import Any
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
 from mvitac.datasets.base import DatasetConfig
-from mvitac.evaluation.evaluate import check_channels, check_unseen
+from mvitac.evaluation.evaluate import check_unseen
+from mvitac.evaluation.features import fitting
 from mvitac.evaluation.leaks import Scored, Source, read_sources
 from mvitac.evaluation.probe import probe_model, scorable, split_rows
 from mvitac.evaluation.probe_config import Standardise
@@ -72,7 +73,7 @@ def adapt(
     model, pack = load(ancestor), data.open(quiet=quiet)
     if lacking := [m for m in model.encoders if m not in pack.spec.modalities]:
         raise ValueError(f"{ancestor} was trained with {lacking[0]}, which the data lacks")
-    check_channels(ancestor, model, pack, tuple(model.encoders))
+    fitting(model, pack)
     packs = {NEW: pack} | _old_packs(model, asked.old, pack, say)
     sources = {  # refuses leaks before anything is trained
         name: check_unseen([ancestor], one, scorable(one), allow_leak=asked.allow_leak)[0]

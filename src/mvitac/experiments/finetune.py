@@ -19,12 +19,12 @@ from typing import Any, Literal
 import numpy as np
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import AnyTask, Task
+from mvitac.data.spec import MODALITIES, AnyTask, Task
 from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.controls import IMAGENET_SIDE, imagenet_trunk
 from mvitac.evaluation.diagnostics import mean_error
-from mvitac.evaluation.evaluate import ProbeConfig, check_channels, check_unseen, chosen
-from mvitac.evaluation.features import features
+from mvitac.evaluation.evaluate import ProbeConfig, check_unseen, chosen
+from mvitac.evaluation.features import features, fitting
 from mvitac.evaluation.leaks import Scored, Source, file_source, leaks_of, read_sources, weights_files
 from mvitac.evaluation.probe import ProbeSplit, own_heads, probe_features, split_rows
 from mvitac.evaluation.scores import each_score
@@ -106,8 +106,8 @@ def finetune(
     model, init = _start(ancestor, data, pack)
     names = (*asked.labels, *asked.values) or tuple(task.name for task in pack.spec.tasks or pack.spec.values)
     tasks = tuple(chosen(pack, ProbeConfig(tasks=names))[0])
-    modalities: Any = asked.modalities or tuple(m for m in pack.spec.modalities if m in model.encoders)
-    check_channels(ancestor, model, pack, modalities or tuple(model.encoders))
+    fitted = fitting(model, pack, asked.modalities or MODALITIES)
+    modalities: Any = asked.modalities or fitted
     method = SupervisedConfig(tasks=tuple(task.name for task in tasks), modalities=modalities, train=asked.train)
     modality = "both" if len(modalities) == 2 else modalities[0]
     job = _Job(asked, model, pack, _run_of(model, init, data, pack, method), tasks, modality, out, say, quiet)

@@ -151,14 +151,9 @@ def changed(run: Run, changes: Mapping[str, Any]) -> Run:
         *path, last = name.split(".")
         inner = value
         for part in path:
-            inner = inner.get(part) if isinstance(inner, dict) else None
-        if (
-            not isinstance(inner, dict)
-            or last not in inner
-            or (last == "name" and path and path[-1] in ("method", "data"))
-        ):
-            known = [key for key in inner if key != "name"] if isinstance(inner, dict) else list(value)
-            raise unknown("field of a run", name, [".".join((*path, key)) for key in known] if inner else known)
+            inner = inner.setdefault(part, {}) if isinstance(inner, dict) else {}
+        if last == "name" or not isinstance(inner, dict):
+            raise ValueError(f"{name} is no field that can be changed")
         inner[last] = list(new) if isinstance(new, tuple) else new
     return Run.load(value)
 

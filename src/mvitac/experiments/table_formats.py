@@ -14,7 +14,6 @@ from tabulate import tabulate
 
 from mvitac.evaluation.intervals import least_p, num_groups_of
 from mvitac.evaluation.score_text import covered, error_text, percent, pipes, with_interval
-from mvitac.evaluation.scores import by_cell
 from mvitac.experiments.plan import Plan, slug
 from mvitac.experiments.table import Line, as_printed, lines_of, plan_of, target_lines
 from mvitac.report.figures import bars, to_png
@@ -47,7 +46,7 @@ def figure(lines: Sequence[Line], task: str, score: str) -> Figure:
 
 
 def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
-    """The whole comparison as Markdown: what was compared, the tables, AUROC, retrieval and cost."""
+    """The whole comparison as Markdown: what was compared, the tables, retrieval and cost."""
     plan, shown = plan_of(result), _any_printed(lines)
     text = [f"# {plan.title or plan.name}"]
     for paragraph in _preface(result, plan, lines):
@@ -56,7 +55,6 @@ def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
     for task, each in target_lines(result).items():
         rows = pipes(*_table(each, plan.reference, False, targets=True))
         text += [f"**{task}**: every target, and its mean absolute error", "", *rows]
-    text += _auroc(result, plan, lines)
     if rows := retrieval_rows(result["retrieval"]):
         text += pipes(["retrieval", "", *(f"{name} %" for name in RETRIEVAL)], rows)
     return "\n".join([*text, *_cost(result)]).rstrip() + "\n"
@@ -171,23 +169,6 @@ def _made(result: dict[str, Any]) -> str:
     runs = list(dict.fromkeys(runs))
     code = f"code {tables}" if runs == [tables] else f"runs at commits {', '.join(runs)}; tables at {tables}"
     return ", ".join([code, *result["run_devices"]])
-
-
-def _auroc(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> list[str]:
-    """AUROC of tasks with two classes in percent: mean over seeds (and folds), lowest and highest."""
-    records = by_cell(result["records"], plan.probes[0])
-    rows: list[tuple[Line, dict[str, str]]] = []
-    for line in (line for line in lines if line.source != "majority"):
-        row = {}
-        for task in line.cells:
-            values = [r["auroc"] for r in records[task, line.modality, line.source] if r.get("auroc") is not None]
-            if values:
-                spread = f" ({percent(min(values))}-{percent(max(values))})" if len(values) > 1 else ""
-                row[task] = f"{percent(sum(values) / len(values))}{spread}"
-        rows += [(line, row)] if row else []
-    tasks = list(dict.fromkeys(task for _, row in rows for task in row))
-    cells = [[*_first_cells(line), *(row.get(task, "") for task in tasks)] for line, row in rows]
-    return pipes(["AUROC %", "modality", *tasks], cells) if rows else []
 
 
 def _cost(result: dict[str, Any]) -> list[str]:

@@ -36,7 +36,6 @@ class Touch:
     num_frames: int = 0
     totals: dict[str, np.ndarray] = field(default_factory=dict)
     values: dict[str, np.ndarray] = field(default_factory=dict)  # task -> values [T] of the newest frame
-    known: list[str] = field(default_factory=list)  # the nearest known touches, if some were given
 
     def add(self, probabilities: dict[str, np.ndarray], values: dict[str, np.ndarray]) -> None:
         self.num_frames += 1
@@ -60,7 +59,6 @@ class Live:
         config: LiveConfig = LiveConfig(),
         *,
         clock: Callable[[], float] = time.monotonic,
-        nearest: Callable[[dict[str, np.ndarray]], list[str]] | None = None,
         record: Callable[[dict[str, np.ndarray], dict[str, Any]], None] | None = None,
         tell: Callable[[Event], None] = lambda event: None,
         free: Sequence[np.ndarray] = (),
@@ -72,7 +70,6 @@ class Live:
             streams: one stream per camera and sensor, by modality; two touch sensors are stacked in channels.
             config: contact detection.
             clock: time in seconds, that of the streams.
-            nearest: turns the engine's outputs into descriptions of known touches.
             record: called with every pair that was used (images, columns).
             tell: called with every fault as it happens, in the thread that noticed it.
             free: an image of each touch sensor without contact; none: the first frames show it.
@@ -83,7 +80,7 @@ class Live:
         """
         _check_inputs(engine, streams)
         self.engine, self.streams, self.config, self.clock = engine, streams, config, clock
-        self.nearest, self.record, self.tell, self.always = nearest, record, tell, always
+        self.record, self.tell, self.always = record, tell, always
         self.all = [s for several in streams.values() for s in several]
         self.leading = (streams.get("touch") or streams["vision"])[0]  # the stream whose new frames start predictions
         _check_window(engine)
@@ -185,8 +182,6 @@ class Live:
             {task: outputs[f"probability_{task}"][0] for task in self.engine.classes},
             {task: outputs[f"value_{task}"][0] for task in self.engine.values},
         )
-        if self.nearest:
-            self.answer.known = self.nearest(outputs)
         self.age = self.clock() - captured
         self._ages[self.num_predictions % NUM_AGES] = self.age
         self.max_age = max(self.max_age, self.age)
@@ -286,8 +281,6 @@ class Live:
         for task, targets in self.engine.values.items():
             found = zip(targets, self.answer.values[task].tolist(), strict=True)
             said[task] = {t["name"]: {"value": v, "unit": t["unit"], "spread": spread_at(t, v)} for t, v in found}
-        if self.answer.known:
-            said["known"] = self.answer.known
         return said
 
     def summary(self) -> dict[str, Any]:

@@ -14,8 +14,8 @@ from matplotlib import colormaps, colors
 from mvitac.data.images import side_by_side
 from mvitac.data.pack import Pack
 from mvitac.deploy.publish import with_probes
-from mvitac.deploy.search import check_pack, nearest
-from mvitac.evaluation.features import features, sample
+from mvitac.deploy.search import nearest
+from mvitac.evaluation.features import features, fitting, sample
 from mvitac.model import Model
 from mvitac.nn.linear_probe import ProbeInfo
 from mvitac.registry import unknown
@@ -30,7 +30,7 @@ class ExplorerData:
 
     def __init__(self, model: Model, pack: Pack, *, limit: int = 20_000) -> None:
         """Compute features of at most ``limit`` random rows that have all images; fit probes if the model has none."""
-        names = check_pack(model, pack)
+        names = fitting(model, pack)
         self.model, self.pack = with_probes(model, pack), pack
         whole = np.flatnonzero(np.all([pack.has(m) for m in names], axis=0))
         if not len(whole):

@@ -21,7 +21,7 @@ from matplotlib.ticker import MaxNLocator
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import percent
 from mvitac.report.html import data_uri
-from mvitac.report.palette import CONTROL_GREYS, HUES, MODALITY_HUES, colour
+from mvitac.report.palette import COLOURS, CONTROL_GREYS, HUES, MODALITY_HUES
 
 MARKERS = ("o", "^", "s", "D", "v", "P", "X", "*")
 DASHES = ("-", "--", ":", "-.")
@@ -74,7 +74,7 @@ def bars(
     for number, (group, cells) in enumerate(groups.items()):
         hue = MODALITY_HUES.get(group, HUES[2 + 2 * (number % 2)])
         axes.text(
-            100 * least, y, group.replace("->", "→"), color=colour(hue), fontweight="bold", va="center", ha="left"
+            100 * least, y, group.replace("->", "→"), color=COLOURS[hue], fontweight="bold", va="center", ha="left"
         )
         spans.append((y + 0.5, y + len(cells) + 0.5))
         for source, cell in cells.items():
@@ -83,7 +83,7 @@ def bars(
             ticks[y] = shorten(source, length)
             top = max(top, cell["high"])
         y += 1.25
-    axes.set_yticks(list(ticks), list(ticks.values()), color=colour("ink"))
+    axes.set_yticks(list(ticks), list(ticks.values()), color=COLOURS["ink"])
     axes.set_ylim(y - 0.6, -0.7)
     axes.set_xlim(100 * least, max(1.0, 100 * (top + 0.15 * (top - least))))
     axes.xaxis.set_major_locator(MaxNLocator(5))
@@ -92,7 +92,7 @@ def bars(
     axes.spines["left"].set_visible(False)
     labels, handles = [], []
     for number, (name, value) in enumerate(lines.items()):
-        look: dict[str, Any] = {"color": colour("soft"), "linestyle": DASHES[1 + number % 3]}
+        look: dict[str, Any] = {"color": COLOURS["soft"], "linestyle": DASHES[1 + number % 3]}
         for low, high in spans:  # not through the names of the groups
             axes.plot([100 * max(least, value)] * 2, [low, high], linewidth=1.2, zorder=0.9, **look)
         handles.append(Line2D([], [], **look))
@@ -106,13 +106,13 @@ def _bar(axes: Axes, y: float, source: str, cell: Mapping[str, Any], hue: str, l
     """One bar with its whisker, if it has one, and its value. Nothing is drawn below ``least``."""
     ends = [cell["low"], cell["high"]] if cell["low"] is not None else [cell["mean"]] * 2
     mean, low, high = (100 * max(least, value) for value in (cell["mean"], *ends))
-    axes.barh(y, mean, 0.74, color=colour(CONTROL_GREYS.get(source, hue)))
+    axes.barh(y, mean, 0.74, color=COLOURS[CONTROL_GREYS.get(source, hue)])
     if low < high:
-        axes.plot([low, high], [y, y], color=colour("ink"), linewidth=1.1, solid_capstyle="butt")
-        axes.plot([low, high], [y, y], "|", color=colour("ink"), markersize=5, markeredgewidth=1.1)
+        axes.plot([low, high], [y, y], color=COLOURS["ink"], linewidth=1.1, solid_capstyle="butt")
+        axes.plot([low, high], [y, y], "|", color=COLOURS["ink"], markersize=5, markeredgewidth=1.1)
     look: dict[str, Any] = {"va": "center", "textcoords": "offset points"}
     look["fontweight"] = "normal" if source in CONTROL_GREYS else "bold"
-    look["bbox"] = {"facecolor": colour("card"), "edgecolor": "none", "pad": 0.5}  # no line runs through the value
+    look["bbox"] = {"facecolor": COLOURS["card"], "edgecolor": "none", "pad": 0.5}  # no line runs through the value
     axes.annotate(percent(cell["mean"]) + leak_mark(cell.get("leak", "")), (high, y), xytext=(5, 0), **look)
 
 
@@ -137,14 +137,14 @@ def curves(
     several = len({line.label for line in lines}) < len(lines)  # seeds: thinner lines
     for line in lines:
         marker = "o" if len(line.x) < 12 else ""
-        look: dict[str, Any] = {"color": colour(line.hue), "marker": marker, "markersize": 3.2}
+        look: dict[str, Any] = {"color": COLOURS[line.hue], "marker": marker, "markersize": 3.2}
         (drawn,) = axes.plot(line.x, line.y, line.dash, linewidth=1.2 if several else 1.8, **look)
         handles.setdefault(line.label, drawn)
         if x == "step" and line.x[0] == 0:  # the value before the first step
-            look = {"color": colour(line.hue), "linestyle": "--", "linewidth": 0.9, "alpha": 0.6}
+            look = {"color": COLOURS[line.hue], "linestyle": "--", "linewidth": 0.9, "alpha": 0.6}
             handles["start"] = axes.axhline(line.y[0], zorder=0.9, **look)
     for number, (name, value) in enumerate((references or {}).items()):
-        look = {"color": colour("soft"), "linestyle": DASHES[1 + number % 3], "linewidth": 1.1}
+        look = {"color": COLOURS["soft"], "linestyle": DASHES[1 + number % 3], "linewidth": 1.1}
         handles[name] = axes.axhline(value, zorder=0.9, **look)
     axes.grid(axis="y")
     axes.xaxis.set_major_locator(MaxNLocator(5, integer=x == "step"))
@@ -167,10 +167,10 @@ def confusion(title: str, counts: np.ndarray, classes: Sequence[str]) -> Figure:
     num = len(classes)
     figure, axes = new_figure(title, 3.4 if num <= 4 else 4.3)
     shares = counts / np.maximum(counts.sum(1, keepdims=True), 1)
-    hues = np.where(np.eye(num, dtype=bool)[..., None], to_rgb(colour("blue")), to_rgb(colour("vermilion")))
+    hues = np.where(np.eye(num, dtype=bool)[..., None], to_rgb(COLOURS["blue"]), to_rgb(COLOURS["vermilion"]))
     # Never opaque under a number.
     alpha = np.where(shares > 0, 0.12 + (0.58 if num <= NUM_NUMBERED else 0.88) * shares, 0)
-    edges, look = np.arange(num + 1) - 0.5, {"edgecolors": colour("panel"), "linewidth": 2 * (num <= 8) or num <= 40}
+    edges, look = np.arange(num + 1) - 0.5, {"edgecolors": COLOURS["panel"], "linewidth": 2 * (num <= 8) or num <= 40}
     axes.pcolormesh(edges, edges, np.dstack([hues, alpha]), **look)
     size: dict[str, Any] = {"fontsize": 110 / num} if num > 8 else {}
     for true, guess in zip(*np.nonzero(shares), strict=True) if num <= NUM_NUMBERED else ():
@@ -203,13 +203,13 @@ def predicted(title: str, points: Sequence[Sequence[float]], unit: str, hue: str
     low, high = float(true.min()), float(true.max())
     margin = 0.3 * max(high - low, 1e-9)
     limits = low - margin, high + margin
-    axes.plot(limits, limits, color=colour("soft"), linewidth=1.1, linestyle=DASHES[1], zorder=0.9)
-    axes.scatter(true, np.clip(guess, *limits), s=11, alpha=0.6, linewidths=0, color=colour(hue))
+    axes.plot(limits, limits, color=COLOURS["soft"], linewidth=1.1, linestyle=DASHES[1], zorder=0.9)
+    axes.scatter(true, np.clip(guess, *limits), s=11, alpha=0.6, linewidths=0, color=COLOURS[hue])
     axes.set(xlim=limits, ylim=limits, aspect="equal", xlabel=f"true, {unit}", ylabel=f"predicted, {unit}")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(5))
     axes.grid()
-    exact = Line2D([], [], color=colour("soft"), linestyle=DASHES[1], linewidth=1.1)
+    exact = Line2D([], [], color=COLOURS["soft"], linestyle=DASHES[1], linewidth=1.1)
     legend_below(figure, [exact], ["exact"], 1)
     return figure
 
@@ -224,10 +224,10 @@ def feature_map(title: str, points: np.ndarray, labels: np.ndarray, classes: Seq
     figure, axes = new_figure(title, 3.5 + 0.16 * -(-num_entries // columns))
     handles, names = [], []
     for label in shown:
-        look: dict[str, Any] = {"color": colour("grey3"), "marker": "."}
+        look: dict[str, Any] = {"color": COLOURS["grey3"], "marker": "."}
         if label >= 0:
             marker = MARKERS[label // len(HUES) % len(MARKERS)]
-            look = {"color": colour(HUES[label % len(HUES)]), "marker": marker}
+            look = {"color": COLOURS[HUES[label % len(HUES)]], "marker": marker}
         at = points[labels == label]
         axes.scatter(at[:, 0], at[:, 1], s=11, alpha=0.8, linewidths=0, **look)
         if len(handles) < num_entries:

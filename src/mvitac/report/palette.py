@@ -25,8 +25,3 @@ HUES = ("blue", "vermilion", "green", "amber", "purple", "sky", "olive", "brown"
 MAP_HUES = (*HUES, "ink", "indigo")  # ten colours for the explorer's map: as many as an eye can tell apart
 MODALITY_HUES = {"touch": "blue", "vision": "vermilion", "both": "green"}
 CONTROL_GREYS = {"imagenet": "grey1", "start": "soft", "untrained": "grey2", "pixels": "grey3", "border": "grey4"}
-
-
-def colour(name: str) -> str:
-    """The colour ``name``."""
-    return COLOURS[name]

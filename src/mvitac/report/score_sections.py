@@ -15,6 +15,7 @@ from mvitac.evaluation.score_text import (
     headline,
     percent,
     score_name,
+    score_rows,
     sources_of,
     tested_on,
     with_interval,
@@ -91,7 +92,7 @@ def _scores(study: Study, summary: dict[str, Any]) -> list[Markup]:
             order = sources_of(found)
             rows += [
                 [f"{task} ({tested_on(found, study.pack.spec.group_by)})"],
-                *tables.score_rows(found, columns),
+                *score_rows(found, columns),
             ]
             muted |= set(order) - set(study.sources)
         if rows:

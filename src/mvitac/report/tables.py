@@ -12,8 +12,6 @@ from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import VALUE_PROBES
 from mvitac.evaluation.score_text import (
     WORDS,
-    balanced_rows,
-    cell_text,
     clipped_text,
     columns_of,
     covered,
@@ -22,6 +20,7 @@ from mvitac.evaluation.score_text import (
     methods_of,
     percent,
     score_name,
+    score_rows,
     sources_of,
     tested_on,
     verdicts,
@@ -88,12 +87,6 @@ def _targets(name: str, task: dict[str, Any]) -> str:
         rows.append([target * (target != above), source, *scores])
         above = target
     return text_table(f"{name}: R2 % and mean absolute error", ["", "", *columns_of(task)], rows, words=2)
-
-
-def score_rows(task: dict[str, Any], modalities: Sequence[str]) -> list[list[str]]:
-    """Rows of source and its score at each of ``modalities``, of one task's summary; of uneven classes balanced ones too."""
-    rows = [[source, *(cell_text(task, source, m) for m in modalities)] for source in sources_of(task)]
-    return rows + balanced_rows(task, modalities)
 
 
 def classes_of(result: dict[str, Any]) -> Iterator[tuple[str, str, list[str], list[dict[str, Any]]]]:
