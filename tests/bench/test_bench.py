@@ -181,9 +181,6 @@ def test_what_is_not_there_is_said(results: list[Path], root: Path, capsys: pyte
     assert blocks[3]["not_run"].endswith("elsewhere is not there") and blocks[2]["form"] == "copy"
     toys = find_suite(str(root / "toys.toml"))
     assert open_set(toys.sets[0], None) == "no --data-root was given, where stripes would be"
-    assert "choose from calandra-v1" in said(capsys, "bench", "external:timm/test_resnet", "--suite", "sim-v9")
-    nowhere = "bench", RANDOM.format(0), "--suite", root / "toys.toml", "--data-root", root / "nowhere"
-    assert "is not a folder" in said(capsys, *nowhere)
     empty = "bench", RANDOM.format(0), "--suite", root / "toys.toml", "--out", root / "nothing"
     assert "was scored on no task of toys: no --data-root was given" in said(capsys, *empty)
     assert not list((root / "nothing").glob("*.json"))
@@ -280,7 +277,6 @@ FORGED: dict[str, tuple[Change, str]] = {
     ),
     "infinity": (put(*VALUES, "sums", "error", 0, 0, value=1e999), "is not finite"),
     "text": (put(*RECORDS, 0, "sums", "correct", value="x"), "its sums are no numbers"),
-    "no sums": (put(*RECORDS, 0, "sums", value={}), "its fields are"),
     "rows": (
         put(*RECORDS, 0, "sums", "n", value=lambda sizes: [2 * n for n in sizes]),
         "is scored on other rows|more correct",
@@ -316,11 +312,8 @@ def test_a_forged_result_is_refused(
 
 DAMAGED: list[tuple[str, Change]] = [
     ("check", put(*RECORDS, 0, "sums", value=3)),
-    ("check", put("blocks", 0, "leaks", value=1e308)),
     ("check", lambda value: value["encoder"].pop("seeds")),
-    ("check", put("blocks", value=["x"])),
     ("board", put(*RECORDS, 0, "modality", value=["touch"])),
-    ("board", put("encoder", "parameters", value=3)),
     ("board", lambda value: value["blocks"][0].pop("data")),
 ]
 
@@ -380,12 +373,6 @@ def test_data_other_than_that_of_its_pins_is_refused(
     assert "other rows, labels or splits than the suite" in said(capsys, "bench", "check", forged)
 
 
-@pytest.mark.parametrize("name", ["untrained", "majority or mean"])
-def test_what_no_encoder_is_called(name: str, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = "bench", RANDOM.format(0), "--suite", root / "toys.toml", "--out", tmp_path, "--name", name
-    assert name in said(capsys, *words)
-
-
 def test_an_encoder_of_one_sense_says_which_it_lacks(root: Path, tmp_path: Path) -> None:
     text = f"{RANDOM.format(7)},reads=touch"
     value = read_result(run_bench([text], find_suite(str(root / "toys.toml")), tmp_path, root, About()))
@@ -437,7 +424,6 @@ def test_encoders_that_cannot_be_scored_are_refused(
     (tmp_path / "six").mkdir()
     fresh(run, replace(spec, touch_channels=6, vision_channels=0), 32).save(tmp_path / "six" / "model.safetensors")
     assert "takes 6 channels of touch, the data has 3" in said(capsys, "bench", tmp_path / "six", *bench)
-    assert "no trained model" in said(capsys, "bench", tmp_path / "nothing", *bench)
     assert not list((tmp_path / "out").glob("*.json"))
     window, difference = replace(spec.window, frames=3), fresh(run, replace(spec, difference=True), 32)
     pack = Pack(root / "stripes")
@@ -497,22 +483,15 @@ def test_shipped_suites_keep_their_definitions() -> None:
     ("text", "expected"),
     [
         ("name = ", "is not a suite"),
-        (SUITE.replace("linear", "quadratic"), "unknown value of suite.probes"),
         (SUITE.replace('"folded"', '"stripes"'), "two sets have one name"),
-        (SUITE.replace('name = "pack" }', 'name = "packs" }', 1), "unknown dataset"),
         (SUITE.replace('"clone" }', '"../clone" }', 1), "not a place below --data-root"),
-        (SUITE.replace('"clone" }', '"/clone" }', 1), "not a place below --data-root"),
         (SUITE.replace('name = "pack" }', 'name = "pack", path = "/etc" }', 1), "names a place in 'path'"),
         (SUITE.replace(FORM, 'data = { name = "mix", parts = ["/a", "/b"] }', 1), "a place in 'parts'"),
         (SUITE.replace(RANDOM.format(1), "external:python:antigravity:fly"), "weights=random"),
-        (SUITE.replace(RANDOM.format(1), "external:timm/resnet18"), "weights=random"),
         (SUITE.replace("external:timm/resnet18.tv_in1k", RANDOM.format(1)), "give external:timm/NAME"),
         (SUITE.replace("folds = 3", "folds = -3"), "folds -3: give 2 or more"),
-        (SUITE.replace("folds = 3", "folds = 3\nval_every = 0"), "val_every 0: give 1 or more"),
         (SUITE.replace('probes = ["linear"]', "probes = []"), "needs at least one of probes, untrained and sets"),
         (SUITE.replace("labels = [0.3]", "labels = [nan]"), "task 'pattern': labels nan: give fractions above 0"),
-        (SUITE.replace('modalities = ["vision"]', "modalities = []"), "task 'pattern' has no modalities"),
-        (SUITE.replace("seed = 0\nuntrained", "seed = -1\nuntrained"), "seed -1: give a number >= 0"),
     ],
 )
 def test_suites_that_are_wrong(text: str, expected: str, tmp_path: Path) -> None:

@@ -335,42 +335,18 @@ def test_onnx_torchscript_and_python_files(pack: Pack, tmp_path: Path, monkeypat
     [
         ("external:sparks:file.safetensors", "choose from external:.*sparsh"),
         ("external:timm/resnet19,weights=random", "unknown trunk 'resnet19'"),
-        ("external:timm/resnet18", "give weights FILE, or scratch"),
         ("external:timm/vit_base_patch16_clip_224.openai", "clip_quickgelu_224.openai"),
         (f"{TINY},sice=32", "unknown field.*'sice'.*'size'"),
         (f"{TINY},size=0", "or less"),
-        (f"{TINY},size=3x4x5", "give 2 numbers"),
-        (f"{TINY},mean=0.1/0.2", "give 3 numbers"),
         (f"{TINY},mean=grey", "give 3 numbers"),
-        (f"{TINY},frames=two", "expected int"),
-        (f"{TINY},reads=smell", "choose from touch, vision, both"),
         (f"{TINY},pool=cls", "needs a network with tokens"),
-        ("external:sparsh:none.safetensors", "does not exist: give a {mae"),
         ("external:none.onnx", "does not exist"),
     ],
 )
-def test_bad_encoders_are_named_in_one_line(
-    text: str,
-    words: str,
-    pack: Pack,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=words.replace("{", r"\{")) as caught:
+def test_bad_encoders_are_named_in_one_line(text: str, words: str) -> None:
+    with pytest.raises(ValueError, match=words) as caught:
         open_model(text)
     assert len(str(caught.value).splitlines()) == 1
-    assert main(["probe", "--encoder", text, "--on", str(pack.path)]) == 2
-    assert len(capsys.readouterr().err.strip().splitlines()) == 1
-
-
-def test_a_damaged_file_of_each_kind_is_one_line(tmp_path: Path) -> None:
-    for name in ("net.onnx", "net.ts", "net.safetensors,trunk=mvitac_tiny"):
-        (tmp_path / name.split(",")[0]).write_bytes(b"something else")
-        with pytest.raises(ValueError, match="net") as caught:
-            open_model(f"external:{tmp_path / name}")
-        assert len(str(caught.value).splitlines()) == 1
 
 
 def test_probe_writes_what_is_needed_to_check_an_encoder(

@@ -37,7 +37,6 @@ from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
 from mvitac.evaluation import probe as probe_module
 from mvitac.methods.mvitac import MViTacConfig
-from mvitac.model import Model
 from mvitac.recipes import recipe
 from mvitac.registry import to_json
 from mvitac.run import Run
@@ -118,56 +117,36 @@ PACKED = "data pack --data folder --path {tmp}/presses.csv --touch-group press -
 # A command, its wrong words, and what the message must hold.
 WORDS: list[tuple[str, str, str]] = [
     ("", "pretrian", "did you mean 'pretrain'"),
-    ("", "data simulte materials", "did you mean 'data simulate'"),
-    ("", "data simulate", "grasps|materials"),
     ("", "data simulate graps --out {out}", "did you mean 'grasps'"),
-    ("", "data simulate materials --num 4", "--out"),
     ("", "data pack --data materails --out {out}", "did you mean 'materials'"),
-    ("", "data info", "PACK"),
     ("", "data info {tmp}/nowhere", "no pack at {tmp}/nowhere"),
-    ("", "pretrain --data graps --out {out}", "did you mean 'grasps'"),
     ("", "pretrain --recipe pape --out {out}", "did you mean 'paper'"),
     ("", "pretrain --from {run}/run.json --data pack --out {out}", "--data"),
     ("", "compare --device zzz --data materials --out {out}", "'zzz'"),
-    (PRETRAIN, "--method mvitca", "did you mean 'mvitac'"),
     (PRETRAIN, "--logger tensorbord", "did you mean 'tensorboard'"),
-    (PRETRAIN, "--logger trackio", "pip install"),
     (PRETRAIN, "--encoder.trunk resnet81", "'resnet81'"),
     (PRETRAIN, "--encoder.trunk mixer_s32_224", "224"),
     (PRETRAIN, "--encoder.weights {tmp}/none.pth", "{tmp}/none.pth"),
     (PRETRAIN, "--encoder.weights imagenet", "mvitac_tiny"),
     (PRETRAIN, "--encoder.temporal mean", "temporal mean"),
-    (PRETRAIN, "--device gpu", "'gpu'"),
     (PRETRAIN, "--device cuda:99", "'cuda:99'"),
-    (PRETRAIN, "--optim.name adma", "--optim.name"),
-    (PRETRAIN, "--sampler random", "--sampler"),
     (PRETRAIN, "--method supervised --method.tasks colour", "'colour'"),
     (PRETRAIN, "--method supervised --method.temperature 1", "--method.temperature"),
-    (PRETRAIN, "--batch-size", "--batch-size"),
     (PRETRAIN, "--batch-size --seed 3", "--batch-size"),
-    (PRETRAIN, "--method", "--method"),
     (PRETRAIN, "--bach-size 16", "--batch-size"),
-    (PRETRAIN, "--frobnicate 3", "--frobnicate"),
     (PRETRAIN, "extra", "extra"),
-    (PRETRAIN, "--resume yes", "yes"),
-    (PRETRAIN, "--batch-size x", "--batch-size"),
     (PRETRAIN, "--steps many", "--steps"),
     (PRETRAIN, "--batch-size " + "9" * 5000, "--batch-size"),
     (PRETRAIN, "--batch-size 100", "72 rows"),
     (PRETRAIN, "--augment.size 64", "--augment.size 32"),
     (PRETRAIN, "--augment.touch.scale 0.9 0.1", "(0.9, 0.1)"),
     (PRETRAIN, "--data.num-frames 2", "--data.order"),
-    (SIMULATE, "--num 0", "num 0"),
     (SIMULATE, "--max-damaged nan", "max_damaged nan"),
     (SIMULATE, "--stride 2", "every frame once"),
     ("probe {run} ", "{run}", "twice"),
-    ("probe {run} ", "--probes liner", "--probes"),
     ("probe {run} ", "--probes knn knn", "twice"),
     ("probe {run} ", "--tasks patern", "did you mean 'pattern'"),
-    ("probe {run} ", "--modalities sound", "--modalities"),
     ("probe {run} ", "--on {run}", "pack.json"),
-    ("probe ", "", "run's folder"),
-    ("probe ", "{tmp}/nowhere", "no trained model at {tmp}/nowhere"),
     ("probe ", "{pack}", "no trained model"),
     (PACKED, "--values text:N", "'hard'"),
     (PACKED, "--values united:N", "'3.2 mN'"),
@@ -176,7 +155,6 @@ WORDS: list[tuple[str, str, str]] = [
     (PACKED, "--values farce:N", "did you mean 'force'"),
     (PACKED, "--values force:N weight=force:mN", "two units"),
     (PACKED, "--labels force --values force:N", "'force'"),
-    (PACKED, "--num-frames 3", "every frame once"),
 ]
 
 
@@ -331,35 +309,27 @@ PACK_FILES = ("pack.json", "samples.parquet", "vision.npy", "touch.npy")
 
 # A command, what is done to the copy of a pack or run, and what the message must hold.
 FILES: list[tuple[str, Spoil, str]] = [
-    *((INFO, within(name, spoil), name) for name in PACK_FILES for spoil in DAMAGES.values()),
+    *((INFO, within(name, spoil), name) for name, spoil in zip(PACK_FILES, DAMAGES.values(), strict=True)),
     *((PROBE, within(MODEL, spoil), MODEL) for spoil in DAMAGES.values()),
     *((AGAIN, within(CHECKPOINT, spoil), CHECKPOINT) for name, spoil in DAMAGES.items() if name != "missing"),
     *((REPEAT, within("run.json", spoil), "run.json") for spoil in DAMAGES.values()),
     (INFO, described("format_version", value=99), "format 99"),
     (INFO, within("pack.json", put("spec", "name", value="mine")), "digest"),
     (INFO, within("pack.json", write('{"name": "\\u001b[2J"}')), "control character"),
-    (INFO, described("num", value=99), "99"),
-    (INFO, described("spec", value=None), "spec"),
     (INFO, described("spec", "touch_channels", value=6), "touch.npy"),
     (INFO, described("spec", "controls", value={"x": ["force"]}), "'force'"),
     (INFO, cell("label_pattern", 3), "label_pattern"),
     (INFO, cell("split", "tests"), "did you mean 'test'"),
     (INFO, cell("group", None), "group"),
     (INFO, cell("id", "0000"), "twice"),
-    (INFO, cell("noise", float("nan")), "noise"),
     ("probe {run} --on {tmp}/p", described("spec", "tasks", value=[]), "no labels"),
-    (PROBE, bomb(MODEL, pickle.dump), MODEL),
     (PROBE, bomb(MODEL, torch.save), MODEL),
     (PROBE, within(MODEL, write(safetensors.torch.save({"w": torch.ones(2)}))), "not written by mvitac"),
     (AGAIN, bomb(CHECKPOINT, pickle.dump), CHECKPOINT),
-    (AGAIN, bomb(CHECKPOINT, torch.save), CHECKPOINT),
     (AGAIN + " --seed 4", lambda path: None, "different run"),
     (AGAIN, within("run.json", put("pack", value="0" * 64)), "different run"),
     (REPEAT, within("run.json", write("[" * 100_000)), "not valid JSON"),
-    (REPEAT, within("run.json", write("[1, 2]")), "not a run's record"),
     (REPEAT, within("run.json", put("run", "optim", "lrr", value=3)), "did you mean 'lr'"),
-    (REPEAT, within("run.json", put("run", "method", "name", value="mvitca")), "did you mean 'mvitac'"),
-    (REPEAT, within("run.json", put("run", "steps", value=True)), "run.steps"),
     (REPEAT, within("run.json", put("run", "data", "path", value="a\0b")), "control character"),
 ]
 
@@ -387,7 +357,7 @@ PLACES = {
 }
 
 
-@pytest.mark.parametrize("command", [SIMULATE, PRETRAIN, "probe {run} --json {out}"])
+@pytest.mark.parametrize("command", [PRETRAIN, "probe {run} --json {out}"])
 @pytest.mark.parametrize(("out", "says"), PLACES.items(), ids=("below a file", "long name", "proc", "there"))
 def test_a_place_nothing_can_be_written_to(
     refused: Callable[..., str], tmp_path: Path, command: str, out: str, says: str
@@ -459,10 +429,8 @@ class Spoilt(Toy):
 @pytest.mark.parametrize(
     ("part", "value", "says"),
     [
-        ("touch", None, "no touch image"),
         ("touch", np.zeros((32, 32, 3)), "float64"),
         ("vision", np.zeros((32, 32), np.uint8), r"\(32, 32\)"),
-        ("label_pattern", "rows", "label_pattern"),
         ("label_pattern", 7, "label_pattern is 7.*0 to 2"),
         ("split", "tset", "did you mean 'test'"),
         ("group", None, "group"),
@@ -474,35 +442,6 @@ def test_bad_samples_make_no_pack(tmp_path: Path, part: str, value: Any, says: s
     with pytest.raises(ValueError, match=says):
         build(Spoilt(part=part, value=value), tmp_path / "p", size=32, quiet=True)
     assert not (tmp_path / "p").exists()
-
-
-# -- embed() ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def model(finished: Path) -> Model:
-    return mvitac.load(finished)
-
-
-GOOD = np.zeros((32, 32, 3), np.uint8)
-
-
-@pytest.mark.parametrize(
-    ("given", "says"),
-    [
-        ({}, "give vision"),
-        ({"touch": np.zeros((32, 32, 6), np.uint8)}, "3 channels.*6"),
-        ({"vision": GOOD[..., 0]}, r"\(32, 32\)"),
-        ({"vision": GOOD[:0]}, r"\(0, 32, 3\)"),
-        ({"vision": []}, "no images"),
-        ({"vision": "photo.png"}, "photo.png does not exist"),
-        ({"vision": [GOOD, None]}, "NoneType"),
-        ({"vision": {"image": GOOD}}, "dict"),
-    ],
-)
-def test_embed(model: Model, given: dict[str, Any], says: str) -> None:
-    with pytest.raises(ValueError, match=says):
-        model.embed(**given)
 
 
 # -- random damage ----------------------------------------------------------------------------------------------------
@@ -550,8 +489,8 @@ def test_random_damage_to_a_pack(pack: Pack, tmp_path: Path, name: str) -> None:
     assert noticed > NUM_DAMAGES // 2
 
 
-def test_random_damage_to_a_model(finished: Path, model: Model, tmp_path: Path) -> None:
-    path, rng, noticed = tmp_path / MODEL, np.random.default_rng(12), 0
+def test_random_damage_to_a_model(finished: Path, tmp_path: Path) -> None:
+    model, path, rng, noticed = mvitac.load(finished), tmp_path / MODEL, np.random.default_rng(12), 0
     data = (finished / MODEL).read_bytes()
     header = 8 + int.from_bytes(data[:8], "little")
     for i in range(2 * NUM_DAMAGES):  # every other one in the header, which is the smaller part

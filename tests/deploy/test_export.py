@@ -258,20 +258,6 @@ def test_an_engine_that_computes_otherwise_is_refused_on_the_spot(onnx: Path, mo
         Engine(onnx)
 
 
-def test_impossible_requests_are_refused_first(
-    model: Model, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with pytest.raises(ValueError, match="no smell encoder"):
-        export(model, pack, tmp_path / "x", ExportConfig(modalities=("smell",)))  # type: ignore[arg-type]
-    larger = toy_pack(tmp_path / "p", size=40)
-    for given, calibrate, config in ((larger, None, ExportConfig()), (pack, larger, ExportConfig(precision="int8"))):
-        with pytest.raises(ValueError, match="p cannot check this model"):
-            export(model, given, tmp_path / "x", config, calibrate=calibrate)
-    monkeypatch.setattr(model, "spec", replace(model.spec, difference=True))
-    with pytest.raises(ValueError, match="at 32 px minus their background"):
-        export(model, pack, tmp_path / "x")
-
-
 def test_an_export_runs_where_openvino_is_missing_and_without_torch(onnx: Path) -> None:
     code = (
         "import sys; sys.modules['openvino'] = None; from mvitac.deploy.engine import Engine;"

@@ -18,7 +18,6 @@ from mvitac.data.source import Sample
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import Materials, MaterialsConfig
 from mvitac.deploy.engine import Engine, about_sensor
-from mvitac.deploy.export import ExportConfig, export
 from mvitac.deploy.publish import with_probes
 from mvitac.evaluation.probe import probe_model
 from mvitac.evaluation.sensors import (
@@ -174,20 +173,6 @@ def test_a_recording_gives_one_image_of_each_touch(engine: Engine, old: Pack, ne
     images = new.images["touch"][new.rows("test")]
     for one, other in zip(found(images), wanted(images), strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-def test_what_cannot_be_shown_is_refused(model: Model, old: Pack, new: Pack, tmp_path: Path) -> None:
-    config = MaterialsConfig(num=30, touches=1, size=32, held_out_sensor=True)
-    few = build(Unlabelled(config), tmp_path / "few", size=32, quiet=True)
-    cases: list[tuple[Pack, ExportConfig, str]] = [
-        (old, ExportConfig(), "no sensor but digit, mini"),
-        (few, ExportConfig(), "needs 32 of different presses.*--new-sensor out"),
-        (new, ExportConfig(modalities=("vision",)), "about touch"),
-    ]
-    for pack, config, why in cases:
-        with pytest.raises(ValueError, match=why):
-            export(model, old, tmp_path / "out", config, new=pack)
-    assert not (tmp_path / "out").exists()
 
 
 def test_live_says_which_sensor_is_new(engine: Engine) -> None:

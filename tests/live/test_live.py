@@ -264,15 +264,6 @@ def test_sources_by_name(tmp_path: Path) -> None:
     assert missing.fault == "unplugged"
 
 
-def test_files_that_cannot_be_read_are_named_at_once(tmp_path: Path) -> None:
-    """Not taken for an unplugged camera, which may come back."""
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "no.mp4").write_text("no video")
-    for name, message in (("empty", "holds no pictures"), ("no.mp4", "cannot be read as a video"), ("empty@0", "rate")):
-        with pytest.raises(ValueError, match=message):
-            source(str(tmp_path / name), "touch")
-
-
 def test_a_video_is_read_to_its_end_without_opencv(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     write_video(tmp_path / "a.mp4", 3, lambda number: numbered(number, "touch"))

@@ -14,7 +14,7 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
 from mvitac.report import contact_sheet
-from mvitac.report.contact_sheet import draw, pair
+from mvitac.report.contact_sheet import pair
 from support.toy import Toy
 
 
@@ -82,33 +82,3 @@ def test_the_command_writes_a_picture(pack: Pack, tmp_path: Path, monkeypatch: p
     assert main(["data", "show", str(pack.path), "--num", "2"]) == 0
     with Image.open(tmp_path / f"{pack.path.name}.png") as picture:
         assert picture.width >= 480
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (["--out", "s.gif"], "ends in .png"),
-        (["--num", "0"], "give at least 1"),
-        (["--by", "nothing"], "unknown task or column 'nothing'"),
-        (["--seed", "-1"], "give a number >= 0"),
-    ],
-)
-def test_mistakes_in_one_line(
-    pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], says: str
-) -> None:
-    extra = [] if "--out" in options else ["--out", str(tmp_path / "s.png")]
-    assert main(["data", "show", str(pack.path), *options, *extra]) == 2
-    error = capsys.readouterr().err
-    assert says in error and error.count("\n") == 1
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_grid_wraps_its_pictures_and_keeps_captions_below_them() -> None:
-    colours = np.random.default_rng(0).integers(0, 200, (8, 3), np.uint8)
-    tiles = [(np.tile(colour, (40, 100, 1)), "one caption") for colour in colours]
-    picture = np.asarray(draw("title", [("heading", tiles)], width=640))
-    corners = [tuple(np.argwhere((picture == colour).all(2))[0]) for colour in colours]
-    tops, lefts = zip(*corners, strict=True)
-    assert picture.shape[1] <= 640 and sorted(set(tops)) == sorted(tops)[::4] and len(set(lefts)) == 4
-    for top, left in corners[4:]:  # the lower row
-        assert picture[top + 40 :, left : left + 100].min() < 100  # text

@@ -36,18 +36,6 @@ def test_points_carry_place_colour_and_row(land: ExplorerData, pack: Pack) -> No
     np.testing.assert_allclose(np.transpose([value["x"], value["y"]]), land.plane("both")[rows], atol=1e-4)
 
 
-def test_at_most_ten_classes_are_coloured_first(land: ExplorerData, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The largest ones, in the order of the classes; the rest is gray until it is chosen."""
-    labels = np.repeat(np.arange(13), [1, 9, 9, 9, 2, 9, 9, 9, 9, 9, 9, 9, 3])
-    monkeypatch.setattr(land, "classes", {"pattern": [f"class {i}" for i in range(13)]})
-    monkeypatch.setattr(land, "labels", {"pattern": labels})
-    monkeypatch.setattr(land, "plane", lambda modality: np.zeros((len(labels), 2)))
-    monkeypatch.setattr(land, "shown", lambda *a, **k: np.arange(len(labels)))
-    value = json.loads(land.points("both", "label", "all", "pattern"))
-    assert len(value["legend"]) == 13 and len(value["hues"]) == 10
-    assert value["coloured"] == [f"class {i}" for i in range(13) if i not in (0, 4, 12)]
-
-
 def test_the_plane_holds_the_most_variance(land: ExplorerData) -> None:
     x = land.x["touch"] - land.x["touch"].mean(0)
     first, second = land.plane("touch").T
@@ -81,13 +69,6 @@ def test_a_pack_of_other_numbers_or_tasks(land: ExplorerData, artifact: Path, pa
     assert found.describe(int(wrong[0])).partition(" · light")[0] in land.describe(int(wrong[0]))
 
 
-def test_a_run_that_is_not_finished_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "checkpoint.pt").touch()
-    assert main(["explore", str(tmp_path / "run")]) == 2
-    assert "the run is not finished" in capsys.readouterr().err
-
-
 def test_values_colour_the_map(land: ExplorerData, monkeypatch: pytest.MonkeyPatch) -> None:
     """The lowest and the highest value have the ends of the scale, a row without one is gray; captions tell the value."""
     force = np.arange(len(land.rows), dtype=float)
@@ -111,12 +92,12 @@ def test_values_colour_the_map(land: ExplorerData, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.fixture(scope="module")
-def address(artifact: Path, smoke_run: Path, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """`mvitac explore` with two models on the striped pairs, in a process of its own."""
+def address(artifact: Path, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """`mvitac explore` on the striped pairs, in a process of its own."""
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
         port = one.getsockname()[1]
-    command = ["explore", str(artifact), str(smoke_run), "--on", str(pack.path), "--port", str(port)]
+    command = ["explore", str(artifact), "--on", str(pack.path), "--port", str(port)]
     said = tmp_path_factory.mktemp("explored") / "said"
     process = begin(main, command, output=said)
     try:
@@ -139,14 +120,13 @@ def test_the_server_answers_to_its_own_names_only(address: str) -> None:
 
 
 def test_the_page_in_a_browser(address: str, land: ExplorerData, pack: Pack, tmp_path: Path) -> None:
-    """Map, hover, click, filter, two runs side by side."""
+    """Map, hover, click, filter."""
     if not CHROMIUM:
         pytest.skip("no Chromium on the PATH: the page is not tested (apt-get install chromium)")
     browser, points = Browser(tmp_path / "profile"), "document.querySelector('[data-points]').dataset.points"
     with contextlib.closing(browser):
         browser.open(address)
         browser.wait(f"{points} == {len(pack.rows('test'))}")
-        assert browser.run("document.querySelectorAll('.map canvas').length") == 2
 
         def place() -> tuple[float, float]:
             left, top, width, height = browser.run(

@@ -152,7 +152,7 @@ def changed(run: Run, changes: Mapping[str, Any]) -> Run:
         inner = value
         for part in path:
             inner = inner.setdefault(part, {}) if isinstance(inner, dict) else {}
-        if last == "name" or not isinstance(inner, dict):
+        if name in ("method.name", "data.name") or not isinstance(inner, dict):
             raise ValueError(f"{name} is no field that can be changed")
         inner[last] = list(new) if isinstance(new, tuple) else new
     return Run.load(value)

@@ -35,28 +35,35 @@ def tip(land: ExplorerData, i: int) -> str:
     return "".join(pictures) + f"<div>{escape(land.describe(i))}</div>"
 
 
-def page(lands: dict[str, ExplorerData]) -> gr.Blocks:
-    """Build the page of one run, or of several runs side by side (name -> its data). All must show the same pack."""
-    first = next(iter(lands.values()))
+def page(name: str, land: ExplorerData) -> gr.Blocks:
+    """Build the page of one run."""
     with gr.Blocks(title="mvitac explorer") as blocks:
-        gr.HTML(f"<h3>{escape(' | '.join(lands))} on {escape(first.pack.spec.name)}</h3>")
-        controls = _controls(first)
+        gr.HTML(f"<h3>{escape(name)} on {escape(land.pack.spec.name)}</h3>")
+        controls = _controls(land)
 
-        def draw(modality: str, by: str, task: str | None, split: str, mistakes: bool) -> list[str]:
-            return [land.points(modality, by, split, task, mistakes=mistakes) for land in lands.values()]
+        def draw(modality: str, by: str, task: str | None, split: str, mistakes: bool) -> str:
+            return land.points(modality, by, split, task, mistakes=mistakes)
 
-        start = draw(*(c.value for c in controls))
-        with gr.Row():
-            views = [_map(name, land, s, len(lands) > 1) for (name, land), s in zip(lands.items(), start, strict=True)]
+        def hover(row: int) -> str:
+            return tip(land, int(row))
+
+        hover.__name__ = "tip"  # scatter.js calls server.tip
+        view: Any = gr.HTML(
+            draw(*(c.value for c in controls)),
+            html_template=MAP,
+            css_template=STYLE,
+            js_on_load=(FILES / "scatter.js").read_text(),
+            server_functions=[hover],
+            elem_classes=["mvitac-map"],
+        )
         chosen = gr.HTML(
             "Click a point for its nearest neighbours; scroll or pinch to zoom, drag to pan, double-click to reset. "
             f"Choose in the legend what is shown in colour. With the map in focus: {KEYS[0].lower()}{KEYS[1:]}"
         )
-        galleries = [gr.HTML(css_template=STYLE) for _ in first.x]
+        galleries = [gr.HTML(css_template=STYLE) for _ in land.x]
         for control in controls:
-            control.change(draw, controls, views)
-        for view, land in zip(views, lands.values(), strict=True):
-            view.click(_on_click(land), controls[2], [chosen, *galleries])
+            control.change(draw, controls, view)
+        view.click(_on_click(land), controls[2], [chosen, *galleries])
     return blocks
 
 
@@ -72,25 +79,6 @@ def _controls(land: ExplorerData) -> list[Any]:
             gr.Dropdown(splits, value="test" if "test" in splits else "all", label="split", min_width=150),
             gr.Checkbox(False, label="mistakes only", container=False),
         ]
-
-
-def _map(name: str, land: ExplorerData, value: str, several: bool) -> Any:
-
-    def hover(row: int) -> str:
-        return tip(land, int(row))
-
-    hover.__name__ = "tip"  # scatter.js calls server.tip
-    with gr.Column(min_width=300):
-        if several:
-            gr.HTML(f"<b>{escape(name)}</b>")
-        return gr.HTML(
-            value,
-            html_template=MAP,
-            css_template=STYLE,
-            js_on_load=(FILES / "scatter.js").read_text(),
-            server_functions=[hover],
-            elem_classes=["mvitac-map"],
-        )
 
 
 def _on_click(land: ExplorerData) -> Callable[[str | None, gr.EventData], list[Any]]:
