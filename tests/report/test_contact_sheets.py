@@ -36,7 +36,7 @@ def test_strips_by_column_and_split(pack: Pack) -> None:
     assert all(len(rows) == 2 for _, rows in found)
     tested, _ = contact_sheet.strips(pack, "bright", split="test", num=50)
     assert set(pack.column("split")[np.concatenate([rows for _, rows in tested])]) == {"test"}
-    for options, says in (({"by": "patern"}, "did you mean 'pattern'"), ({"split": "dev"}, "unknown split 'dev'")):
+    for options, says in (({"by": "patern"}, "did you mean 'pattern'"), ({"split": "dev"}, "no rows in split dev")):
         with pytest.raises(ValueError, match=says):
             contact_sheet.strips(pack, **options)
 

@@ -72,8 +72,6 @@ def bench(argv: list[str]) -> None:
         print(f"written: {path}")
         return
     suite = find_suite(options.suite)
-    if options.data_root and not options.data_root.is_dir():
-        raise ValueError(f"--data-root {options.data_root} is not a folder: give the one with the clones of real data")
     with shown():
         path = run_bench(options.models, suite, options.out, options.data_root, options.about)
     result = read_result(path)

@@ -65,8 +65,6 @@ def check(argv: list[str]) -> int:
     usual = _SourceOptions(data=dataset(chosen["--data"]))
     options = parse(_SourceOptions, rest, f"data check {name}", default=usual, description=_MANUAL)
     draw_sheet = _sheet(name, options)
-    if options.items < 0:
-        raise ValueError(f"--items {options.items}: give the number of items to read, 0 for all")
     data: Any = options.data
     if isinstance(data, PackConfig):
         return _report(str(data.path), examine_pack(data.path, data.frame_window(), draw_sheet), options)

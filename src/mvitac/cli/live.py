@@ -34,48 +34,52 @@ from mvitac.system.progress import shown, work
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Options:
+class _Common:
+    model: Positional[str]
+    """Folder of an export (fastest); or of a run or an artifact, or owner/name on the Hub, which is exported first."""
+    vision: str | None = None
+    """SOURCE of the camera. Of other data than recordings: the name of its images."""
+    touch: tuple[str, ...] = ()
+    """SOURCE of the touch sensor, or of both of a gripper: left right. Of other data: the name of its images."""
+    background: tuple[Path, ...] = ()
+    """Image of the touch sensor without contact, one of each sensor, instead of the first frames."""
+    threads: int = 0
+    """CPU threads for the model; 0 = all cores."""
+    live: Annotated[LiveConfig, tyro.conf.arg(name="")] = LiveConfig()
+
+    def free(self) -> list[np.ndarray]:
+        return [np.array(decode(file)) for file in self.background]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Options(_Common):
     """Predict from live frames: only the newest frame counts, old ones are never used. Every prediction is a line of JSON on
     stdout, with time in seconds, classes with confidence, and values with unit and spread; every fault is a line on
     stderr. Ctrl-C ends it with a summary.
 
     A SOURCE is a camera (its number, /dev/videoN or serial:NAME; @WIDTHxHEIGHT and @FPS after it ask for that mode, e.g.
-    serial:D20345@320x240@60), a video file, a folder of pictures[@FPS], or sim[:SEED].
+    serial:D20345@320x240@60), a video file, a folder of pictures[@FPS], or sim[:SEED]. Without any, all are simulated.
     """
 
-    model: Positional[str]
-    """Folder of an export (fastest); or of a run or an artifact, or owner/name on the Hub, which is exported first."""
-    vision: str | None = None
-    """SOURCE of the camera."""
-    touch: tuple[str, ...] = ()
-    """SOURCE of the touch sensor, or of both of a gripper: left right. Without any source, all are simulated."""
     sensor: str = ""
     """Name of the touch sensor, as in column sensor of the training data: live says if the model never met it."""
     record: Path | None = None
     """Record the frames as a pack in this new folder, at most ten pairs a second."""
     seconds: float | None = None
     """Stop after this many seconds."""
-    threads: int = 0
-    """CPU threads for the model; 0 = all cores."""
     stale: float = 0.5
     """Age in seconds from which a frame is too old to be used."""
     json: Path | None = None
     """Write the summary to this file."""
     always: bool = False
     """Predict from every frame, in contact or not."""
-    background: tuple[Path, ...] = ()
-    """Image of the touch sensor without contact, one of each sensor, instead of the first frames."""
-    live: Annotated[LiveConfig, tyro.conf.arg(name="")] = LiveConfig()
 
 
 def live(argv: list[str]) -> None:
     """mvitac live MODEL [--vision SOURCE] [--touch SOURCE...] [--record DIR]"""
     options = parse(_Options, argv, "live")
-    for name, seconds in (("--seconds", options.seconds), ("--stale", options.stale)):
-        if seconds is not None and not seconds > 0:
-            raise ValueError(f"{name} {seconds:g}: give seconds, more than 0")
     check_json(options.json)
-    free = [np.array(decode(file)) for file in options.background]
+    free = options.free()
     engine = _engine(options.model, options.threads)
     streams: Any = _streams(options, engine)
     if not (options.vision or options.touch):
@@ -139,28 +143,17 @@ def _capture(loop: Live) -> Iterator[threading.Event]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _PredictOptions:
+class _PredictOptions(_Common):
     """Predict from every frame of a recording, as fast as the model computes, into a table: frame number, time, contact,
     classes with probabilities, values with spread (docs/live.md).
 
-    A SOURCE is a video file, or a folder of images[@FPS].
+    A SOURCE is a video file, or a folder of images[@FPS]. Frames of several recordings are matched by time.
     """
 
-    model: Positional[str]
-    """Folder of an export (fastest); or of a run or an artifact, or owner/name on the Hub, which is exported first."""
     source: Positional[str | None] = None
     """SOURCE, where the model takes one input; or other data: a pack, a table, a bag, whatever --data reads."""
-    vision: str | None = None
-    """SOURCE of the camera. Frames of several recordings are matched by time. Of other data: the name of its images."""
-    touch: tuple[str, ...] = ()
-    """SOURCE of the touch sensor, or of both of a gripper: left right. Of other data: the name of its images."""
     out: Path = Path("predictions.csv")
     """The table, a row for each frame."""
-    background: tuple[Path, ...] = ()
-    """Image of the touch sensor without contact, one of each sensor, instead of the first frames."""
-    threads: int = 0
-    """CPU threads for the model; 0 = all cores."""
-    live: Annotated[LiveConfig, tyro.conf.arg(name="")] = LiveConfig()
 
 
 def predict(argv: list[str]) -> None:
@@ -170,7 +163,6 @@ def predict(argv: list[str]) -> None:
     if files and bool(options.source) == bool(options.vision or options.touch):
         raise ValueError("give one SOURCE, or those of --vision and --touch")
     check_json(options.out, "--out")
-    free = [np.array(decode(file)) for file in options.background]
     given = {"vision": (options.vision,) if options.vision else (), "touch": options.touch}
     opened = {m: [recording(text) for text in texts] for m, texts in given.items() if texts and files}
     single = [recording(options.source)] if options.source and files else []
@@ -182,7 +174,7 @@ def predict(argv: list[str]) -> None:
         _write(options.out, pack_tables(engine, pack), pack.num)
         return
     opened = dict.fromkeys(engine.inputs, single) if single else opened
-    recordings = Recordings(engine, opened, options.live, free)
+    recordings = Recordings(engine, opened, options.live, options.free())
     _write(options.out, recordings.tables(), recordings.num)
     if num := recordings.left_out:
         _say(f"{num} frames are left out: damaged, or without a frame of the other recording within {TOGETHER} s")

@@ -33,10 +33,8 @@ def pretrain(argv: list[str]) -> None:
     chosen, rest = selectors(argv, ("--method", "--data", "--recipe", "--from", "--logger"))
     base = _chosen_run(chosen, phased=False)
     if not asks_help(rest) and not {"--data", "--from"} & chosen.keys():
-        raise ValueError(
-            f"name the data to learn from: --data {'|'.join(DatasetConfig.choices)} (or --from RUN.JSON); without data of"
-            " your own: mvitac demo, or mvitac pretrain --data materials --recipe quick, which simulates"
-        )
+        names = "|".join(DatasetConfig.choices)
+        raise ValueError(f"name the data: --data {names}, a path, or --from RUN.JSON; without any: mvitac demo")
     description = f"""Pre-train encoders without labels.
 
     First choose, then change single fields below (defaults are those of the chosen recipe):

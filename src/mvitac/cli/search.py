@@ -129,9 +129,4 @@ def find(argv: list[str]) -> None:
 
 def _picture(files: Sequence[Path]) -> np.ndarray:
     """One RGB picture [H, W, 3 x files]: the files stacked in channels, as ``data pack`` reads and stacks them."""
-    parts = [np.asarray(decode(file)) for file in files]
-    for file, part in zip(files, parts, strict=True):
-        if part.shape != parts[0].shape:
-            (h, w), (h2, w2) = parts[0].shape[:2], part.shape[:2]
-            raise ValueError(f"{files[0]} is {w} x {h}, {file} is {w2} x {h2}: stacked sensors need one size")
-    return np.concatenate(parts, axis=2)
+    return np.concatenate([np.asarray(decode(file)) for file in files], axis=2)

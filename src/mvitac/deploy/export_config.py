@@ -30,10 +30,6 @@ class ExportConfig:
     threads: int = 0
     """CPU threads while measuring latency; 0 = all cores."""
 
-    def __post_init__(self) -> None:
-        if self.num_rows < 1:
-            raise ValueError(f"--rows {self.num_rows}: give at least 1")
-
     @property
     def tolerance(self) -> dict[str, float]:
         """The limits of ``parity``."""

@@ -76,9 +76,11 @@ class Live:
             always: predict from every frame; without contact, an answer is that of its frame alone.
 
         Raises:
-            ValueError: the engine takes other inputs.
+            ValueError: the engine takes other inputs, or differences that live input does not have.
         """
-        _check_inputs(engine, streams)
+        given = {m: 3 * len(several) for m, several in streams.items()}
+        if given != (wanted := {m: shape[2] for m, shape in frame_shapes(engine).items()}):
+            raise ValueError(f"the model takes channels {wanted}, the sources have {given}")
         self.engine, self.streams, self.config, self.clock = engine, streams, config, clock
         self.record, self.tell, self.always = record, tell, always
         self.all = [s for several in streams.values() for s in several]
@@ -304,13 +306,3 @@ def _check_window(engine: Engine) -> None:
     window = engine.window
     if window and window["minus_first"] and (engine.difference or "vision" in window["of"]):
         raise ValueError("live learns the background of touch alone: not that of vision, nor frames minus it twice")
-
-
-def _check_inputs(engine: Engine, streams: dict[str, Sequence[Stream]]) -> None:
-    """ValueError if the number of streams is not that of the engine's inputs."""
-    for modality, (_, _, channels) in frame_shapes(engine).items():
-        given, wanted = len(streams.get(modality, ())), channels // 3
-        if given != wanted:
-            raise ValueError(f"the model takes {wanted} {modality} stream(s), {given} given")
-    if extra := set(streams) - set(engine.inputs):
-        raise ValueError(f"the model has no input for {', '.join(sorted(extra))}: leave it out")

@@ -33,10 +33,6 @@ def strips(
     Of its ``num`` rows, those of different groups (within one group: touches) come first. Returns at most ``LIMIT``
     strips, each a heading such as ``wood: 48 rows, 12 objects`` and its rows, and their number without it.
     """
-    if split and split not in SPLITS:
-        raise unknown("split", split, SPLITS)
-    if num < 1:
-        raise ValueError(f"num {num}: give at least 1")
     names = [task.name for task in pack.spec.tasks]
     by = by or (names[0] if names else "group")
     if by in names:

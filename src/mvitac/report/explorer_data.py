@@ -18,7 +18,6 @@ from mvitac.deploy.search import nearest
 from mvitac.evaluation.features import features, fitting, sample
 from mvitac.model import Model
 from mvitac.nn.linear_probe import ProbeInfo
-from mvitac.registry import unknown
 from mvitac.report.palette import COLOURS, MAP_HUES
 
 LEVELS = 32  # number of colours between the lowest and the highest value
@@ -72,8 +71,6 @@ class ExplorerData:
 
     def _components(self, modality: str) -> tuple[np.ndarray, np.ndarray]:
         """The plane [N, 2], and the share of the variance along each of its axes [2]."""
-        if modality not in self.modalities:
-            raise unknown("modality", modality, self.modalities)
         if modality not in self._planes:
             x = np.concatenate([self.x[m] for m in self.x], axis=1) if modality == "both" else self.x[modality]
             x = x - x.mean(0)
