@@ -60,10 +60,8 @@ class Adapter(Registered, ABC):
     """Frames that the network sees at once, stacked on channels unless the adapter says otherwise."""
     stride: float | None = None
     """Distance of the frames."""
-    background: Literal["", "minus", "none"] = ""
-    """minus: of difference images, image - background + offset. none: images as they are."""
     offset: float | None = None
-    """0 to 1, with background=minus."""
+    """0 to 1: difference images become image - background + offset. Default: images as they are, or the owner's."""
     pool: Literal["", "mean", "cls"] = ""
     """Features: the mean of the places, or the first token."""
     title: str = ""
@@ -92,10 +90,6 @@ class Adapter(Registered, ABC):
         for name, at in (("mean", 0), ("std", 1)):
             if text := getattr(self, name):
                 changes[name] = STATISTICS[text][at] if text in STATISTICS else _numbers(text, name, float, "/", 3)
-        if self.background == "minus":
-            changes.setdefault("offset", 0.5 if made.offset is None else made.offset)
-        elif self.background == "none":
-            changes["offset"] = None
         made = replace(made, **changes)
         return made.resized_to(self.sides(made.size)) if self.size else made
 

@@ -1,10 +1,8 @@
 """Encoders of other people as models: ``mvitac.load("external:...")`` and ``mvitac probe --encoder external:...``.
 
-    model = mvitac.load("external:timm/vit_tiny_patch16_224,weights=random")
-    model, pack = model.on(mvitac.Pack("packs/materials"))     # for the channels, frames and backgrounds of this data
-    records = probe_model(model, pack, pack.spec.all_tasks, ["touch"], ["linear"])
-
-Two encoders, one for each sense, are joined by "+": "external:sparsh:FILE+external:timm/resnet18".
+model = mvitac.load("external:timm/vit_tiny_patch16_224,weights=random")
+model, pack = model.on(mvitac.Pack("packs/materials"))     # for the channels, frames and backgrounds of this data
+records = probe_model(model, pack, pack.spec.all_tasks, ["touch"], ["linear"])
 """
 
 from typing import Any, NoReturn
@@ -12,7 +10,7 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor, nn
 
-from mvitac.bench.external.base import START, UNKNOWN
+from mvitac.bench.external.base import UNKNOWN
 from mvitac.bench.external.encoder import ExternalEncoder, Layout, open_encoder
 from mvitac.data.pack import Pack
 from mvitac.data.spec import MODALITIES, DataSpec, Window
@@ -107,10 +105,8 @@ class ExternalModel(Model):
         moving = {m: want for m, want in wants.items() if want.frames > 1}
         if moving and not pack.spec.window.active:
             try:
-                if len(asked := {(want.frames, want.stride) for want in moving.values()}) > 1:
-                    raise ValueError("the two encoders want other windows: give both the same frames and stride")
-                frames, stride = asked.pop()
-                pack = windowed(pack, Window(frames=frames, stride=stride, of=tuple(moving)))
+                want = next(iter(moving.values()))
+                pack = windowed(pack, Window(frames=want.frames, stride=want.stride, of=tuple(moving)))
             except ValueError as error:
                 if any(parts[m].adapter.stride is not None for m in moving):
                     raise
@@ -176,17 +172,6 @@ def is_noncommercial(licence: str) -> bool:
 
 
 def open_model(text: str) -> ExternalModel:
-    """Open the encoders that ``text`` names: one, or one for each sense joined by "+".
-
-    ValueError if there is no such encoder, or two encoders read the same sense.
-    """
-    opened = [open_encoder(START + part) for part in text.removeprefix(START).split(f"+{START}")]
-    parts: dict[str, ExternalEncoder] = {}
-    taken = {part.adapter.reads for part in opened}
-    for part in opened:
-        reads = part.adapter.reads
-        given = [m for m in MODALITIES if reads in (m, "both") and (reads == m or m not in taken)]
-        if not given or set(given) & parts.keys() or len(opened) > 2:
-            raise ValueError(f"{text}: each sense has one encoder: give reads=touch to one, reads=vision to the other")
-        parts.update(dict.fromkeys(given, part))
-    return ExternalModel(text, {m: parts[m] for m in MODALITIES if m in parts})
+    """Open the encoder that ``text`` names; ValueError if there is none."""
+    part = open_encoder(text)
+    return ExternalModel(text, {m: part for m in MODALITIES if part.adapter.reads in (m, "both")})
