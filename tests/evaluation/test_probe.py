@@ -34,7 +34,6 @@ from mvitac.evaluation.probe import probe_all, probe_features, probe_model, spli
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.run_names import names_of
 from mvitac.evaluation.score_text import verdicts
-from mvitac.evaluation.scores import summarise
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model_files import fresh, load
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders
@@ -189,14 +188,6 @@ def test_folds_test_every_group_once_that_no_run_learned_from(pack: Pack, runs: 
     assert (runs[0] / "probe.folds.json").exists() and (runs[0] / "probe.json").exists() == before
 
 
-def test_majority_is_the_share_of_trains_commonest_class(pack: Pack, result: dict) -> None:
-    rows = split_rows(pack, pack.spec.tasks[1])
-    labels = pack.column("label_bright")
-    common = np.bincount(labels[np.concatenate([rows.train, rows.val])]).argmax()
-    expected = float((labels[rows.test] == common).mean())
-    assert result["summary"]["bright"]["none"]["majority"]["mean"] == pytest.approx(expected)
-
-
 def test_untrained_is_this_runs_trunk_before_training(pack: Pack, tmp_path: Path) -> None:
     """What train() begins with: one step of next to no length leaves it where it was."""
     run = replace(recipe("smoke", PackConfig(path=pack.path)), steps=1, eval_every=0, log_every=1)
@@ -206,15 +197,6 @@ def test_untrained_is_this_runs_trunk_before_training(pack: Pack, tmp_path: Path
     for name, value in start.named_parameters():
         torch.testing.assert_close(value, begun[name], rtol=0, atol=1e-20)
     assert any(not torch.allclose(value, begun[name]) for name, value in seed1.named_parameters())
-
-
-def test_summary_shows_a_controls_only_probe(result: dict) -> None:
-    knn = summarise(result["records"], "knn")
-    assert "majority" in knn["pattern"]["none"] and "pixels" in knn["pattern"]["touch"]
-    assert knn["pattern"]["touch"]["pixels"] == result["summary"]["pattern"]["touch"]["pixels"]  # its linear one
-    wanted = {"source": "mvitac", "task": "pattern", "modality": "touch", "probe": "knn"}
-    scores = [r["accuracy"] for r in result["records"] if wanted.items() <= r.items()]
-    assert len(scores) == 2 and knn["pattern"]["touch"]["mvitac"]["mean"] == pytest.approx(np.mean(scores))
 
 
 @pytest.mark.parametrize("damage", ["bit", "cut", "no digest"])

@@ -70,12 +70,6 @@ def model(smoke_run: Path) -> Model:
     return load(smoke_run)
 
 
-def test_sensors_are_numbered_by_name(pack: Pack, others: Pack) -> None:
-    assert others.sensor_names == ("negative", "plain")
-    assert [others.sensor_names[n] for n in others.sensors[:3]] == ["plain", "negative", "plain"]
-    assert pack.sensor_names == ("toy",) and not pack.sensors.any()
-
-
 def test_models_keep_the_sensors_of_their_training_rows(
     smoke_run: Path, pack: Pack, others: Pack, tmp_path: Path
 ) -> None:

@@ -20,13 +20,11 @@ from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.intervals import interval, paired_difference
-from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.regressors import fit_curve, fit_ridge
 from mvitac.evaluation.scores import pool
 from mvitac.evaluation.value_scores import r2_without_each_group, score_values
 from mvitac.recipes import recipe
 from mvitac.training.loop import train
-from support.toy import Toy
 
 NEWTON = (Target(name="force_n", unit="N"),)
 POSE = (Target(name="z_mm", unit="mm"), Target(name="tilt_deg", unit="deg"))
@@ -155,13 +153,6 @@ def test_a_control_may_be_a_curve() -> None:
     assert r2_score(y, fit_ridge(x, y, 50)[0](x)) < 0.1
 
 
-def test_rows_of_a_task_have_at_least_one_of_its_values(measured: Pack) -> None:
-    light, both = measured.spec.values
-    only_weight = replace(both, targets=both.targets[1:])
-    assert len(split_rows(measured, light).all) == len(split_rows(measured, both).all) == measured.num
-    assert len(split_rows(measured, only_weight).all) == measured.num * 2 // 3
-
-
 def test_probes_of_classes_and_values_side_by_side(measured: Pack, tmp_path: Path) -> None:
     run = replace(recipe("smoke", PackConfig(path=measured.path)), steps=2, eval_every=0)
     asked = ProbeConfig(probes=("linear", "paper", "knn"), modalities=("touch",))
@@ -205,16 +196,6 @@ def test_packs_with_other_units_cannot_be_joined(measured: Pack) -> None:
     other.spec = replace(other.spec, values=(task,))
     with pytest.raises(ValueError, match=r"level in levels in .* and level in %"):
         JoinedPack(measured, other)
-
-
-def test_a_pack_refuses_infinite_values(tmp_path: Path) -> None:
-    class Broken(Toy):
-        def read(self, item: int) -> list:
-            (made,) = super().read(item)
-            return [replace(made, columns={**made.columns, "level": float("inf") if item == 5 else 1.0})]
-
-    with pytest.raises(ValueError, match="level is inf in row 5: a value is a finite number"):
-        build(Broken(num=12, values=True), tmp_path / "pack", size=32, workers=1, quiet=True)
 
 
 def test_folds_are_pooled_to_the_scores_of_all_groups_together() -> None:

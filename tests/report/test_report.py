@@ -356,12 +356,6 @@ def test_probe_and_card_give_one_text_for_one_score(
         assert all(text in each for each in shown), cell
 
 
-def test_an_interval_does_not_depend_on_the_order_of_seeds() -> None:
-    counts = [[2 * s * s + i * (s + 1) % 3 for i in range(7)] for s in range(3)]
-    records = [{"seed": s, "group_sizes": [20] * 7, "group_correct": counts[s]} for s in range(3)]
-    assert interval(records) == interval(records[::-1]) == interval(records[1:] + records[:1])
-
-
 @dataclass(frozen=True)
 class OneTested(Noise):
     """All but one group to learn from."""
