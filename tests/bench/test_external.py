@@ -163,7 +163,7 @@ def test_the_same_network_gives_the_same_features_as_in_a_run(pack: Pack, tmp_pa
 
 def test_load_gives_a_model_that_embeds_and_is_probed(pack: Pack) -> None:
     model = mvitac.load(TINY)
-    assert isinstance(model, ExternalModel) and model.seed == 0 and model.trained_on == ("nothing",)
+    assert isinstance(model, ExternalModel) and model.seed == 0 and model.trained_on == "nothing"
     model, own = model.on(pack)
     embedded = model.embed(touch=pack.images["touch"][rows(pack)])["touch"]
     np.testing.assert_allclose(embedded.numpy(), features(model, own, "touch", rows(pack)), atol=1e-5)
@@ -185,7 +185,7 @@ def test_seeds_draw_other_weights_and_repeat_themselves() -> None:
 def test_sensors_are_encoded_one_by_one(pack: Pack, tmp_path: Path) -> None:
     two = toy_pack(tmp_path / "two", touch_channels=6, num=12)
     model, two = open_model(f"{TINY},reads=touch").on(two)
-    one = ExternalModel(model.text, model.parts, pack.spec, 32)
+    one = ExternalModel(model.text, model.part, pack.spec, 32)
     both = torch.from_numpy(np.array(two.images["touch"][:3])).permute(0, 3, 1, 2)
     each = [one.features("touch", both[:, at : at + 3]) for at in (0, 3)]
     torch.testing.assert_close(model.features("touch", both), torch.cat(each, dim=1))
@@ -209,7 +209,7 @@ def test_windows_are_opened_where_the_data_has_an_order(pack: Pack, tmp_path: Pa
 def test_backgrounds_are_subtracted_where_the_pack_has_them(pack: Pack) -> None:
     model = open_model(f"{TINY},reads=touch,offset=0.5,mean=none,std=none")
     assert "no" in model.on(pack)[0].notes[0]
-    changed = ExternalModel(model.text, model.parts, replace(pack.spec, difference=True), 32)
+    changed = ExternalModel(model.text, model.part, replace(pack.spec, difference=True), 32)
     grey = torch.full((1, 3, 32, 32), 128, dtype=torch.uint8)
     half = torch.full((1, 3, 32, 32), 0.5)
     network = model.parts["touch"].network

@@ -286,7 +286,7 @@ def test_start_weights_of_which_their_owner_says_it(
     run = replace(run, encoder=run.encoder.changed(weights=str(file)))
     assert [file_source(file).name for file in weights_files(run)] == [theirs.name]
     encoder = open_model(f"external:{file},trunk={run.encoder.touch.trunk},size=32")
-    assert encoder.trained_on == (text or UNKNOWN,)
+    assert encoder.trained_on == (text or UNKNOWN)
 
 
 def test_other_names_of_the_data_count_too(pack: Pack, tmp_path: Path) -> None:

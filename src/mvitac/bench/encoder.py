@@ -7,9 +7,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from tyro.conf import Fixed
-
 from mvitac.bench.external import ExternalModel
+from mvitac.bench.external.base import NOTHING
 from mvitac.bench.result import FORM, GUESS, read_signed, sign, write_result
 from mvitac.bench.score import Entry, score_suite
 from mvitac.bench.suite import Suite
@@ -36,14 +35,10 @@ class About:
     """Licence of the weights. Default: that of the adapter of an external encoder."""
     trained_on: str = ""
     """Names of all data that it was trained on. Default: what its run or its adapter says."""
-    images_seen: Fixed[int] = 0
-    """Images that it saw in training, with repeats. Default: steps x batch size of its run."""
 
     def __post_init__(self) -> None:
         if self.name in (*CONTROLS, GUESS):
             raise ValueError(f"--name {self.name} is the name of a control: give another")
-        if self.images_seen < 0:
-            raise ValueError(f"images_seen {self.images_seen}: give the number of images, 1 or more")
 
 
 def run_bench(places: Sequence[str], suite: Suite, out: Path, root: Path | None, about: About) -> Path:
@@ -113,10 +108,9 @@ def describe(models: Sequence[Model], places: Sequence[str], about: About) -> di
 def _of_external(model: ExternalModel) -> dict[str, Any]:
     described = model.describe()
     licences = dict.fromkeys(part["licence"] for part in described["encoders"].values())
-    known = None if UNKNOWN in model.trained_on else "; ".join(model.trained_on)
-    nothing = model.trained_on == ("nothing",)
+    known = None if model.trained_on == UNKNOWN else model.trained_on
     about = {"name": model.title, "licence": "; ".join(licences), "trained_on": known}
-    return {**about, "images_seen": 0 if nothing else None, "external": described}
+    return {**about, "images_seen": 0 if known == NOTHING else None, "external": described}
 
 
 def _of_run(model: Model, path: Path) -> dict[str, Any]:

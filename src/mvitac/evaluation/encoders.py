@@ -10,7 +10,7 @@ from typing import Any
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask
 from mvitac.evaluation.controls import Records
-from mvitac.evaluation.leaks import UNKNOWN, declared_leak
+from mvitac.evaluation.leaks import declared_leak
 from mvitac.evaluation.probe import probe_model, probes_of
 from mvitac.registry import unknown
 from mvitac.system.progress import work
@@ -61,8 +61,7 @@ def probe_encoders(
         num = (2 if random else 1) * len(modalities) * sum(len(probes_of(task, probes)) for task in tasks)
         with work(f"probing {model.title}", num, "probes"):
             for each, own in ((model, {"encoder": model.text}), *(((random, {}),) if random else ())):
-                said = None if UNKNOWN in each.trained_on else "; ".join(each.trained_on)
-                leak = declared_leak(said, [pack.spec.name.split(" (")[0]])
+                leak = declared_leak(each.trained_on, [pack.spec.name.split(" (")[0]])
                 known = {"source": each.title, "seed": each.seed, **own, "leak": leak}
                 records += [{**known, **record} for record in probe_model(each, pack, tasks, modalities, probes)]
     return records

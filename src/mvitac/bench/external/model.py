@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from mvitac.bench.external.base import UNKNOWN
 from mvitac.bench.external.encoder import ExternalEncoder, Layout, open_encoder
 from mvitac.data.pack import Pack
-from mvitac.data.spec import MODALITIES, DataSpec, Window
+from mvitac.data.spec import DataSpec, Window
 from mvitac.data.windows import windowed
 from mvitac.model import Model
 from mvitac.registry import to_json
@@ -25,37 +25,36 @@ PICTURES = DataSpec(
 
 
 class ExternalModel(Model):
-    """Frozen encoders by modality, with the interface of ``Model`` that probes, features and ``embed`` use.
+    """A frozen encoder with the interface of ``Model`` that probes, features and ``embed`` use.
 
     There is no run, no shared space and no own head. Images of several sensors are encoded one by one and their features
-    joined. Where an encoder needs more frames than a row has, the oldest one is repeated.
+    joined. Where it needs more frames than a row has, the oldest one is repeated.
 
     Attributes:
-        text: What named the encoders.
-        name: Their names.
-        parts: modality -> opened encoder.
-        notes: What the data lacks that an encoder wants.
+        text: What named the encoder.
+        name: Its name.
+        parts: modality -> the opened encoder, bound to its images.
+        notes: What the data lacks that the encoder wants.
     """
 
     def __init__(
         self,
         text: str,
-        parts: dict[str, ExternalEncoder],
+        part: ExternalEncoder,
         spec: DataSpec = PICTURES,
         stored: int = 0,
         notes: tuple[str, ...] = (),
     ) -> None:
         nn.Module.__init__(self)
-        self.text, self.spec, self.notes = text, spec, notes
+        self.text, self.spec, self.notes, self.name = text, spec, notes, part.loaded.title
         gains = {"touch": 2.0 if spec.difference else 0.0, "vision": 0.0}
         if spec.window.minus_first:
             gains |= {m: 2.0 * max(1.0, gains[m]) for m in spec.window.of}
         self.parts: dict[str, ExternalEncoder] = {}
-        for modality, part in parts.items():
+        for modality in (m for m in spec.modalities if part.adapter.reads in (m, "both")):
             sensors = max(1, spec.channels(modality) // 3 // spec.frames(modality))
             self.parts[modality] = part.bound(Layout(sensors, spec.frames(modality), gains[modality]))
-        self.name = " + ".join(dict.fromkeys(part.loaded.title for part in parts.values()))
-        self.stored = stored or max(self.sides(modality)[0] for modality in parts)
+        self.stored = stored or max(part.preprocessing.size)
         self.encoders = nn.ModuleDict(self.parts)
         self.projectors, self.classifiers, self.tasks, self.probes = nn.ModuleDict(), nn.ModuleList(), (), {}
         self.eval()
@@ -69,24 +68,29 @@ class ExternalModel(Model):
 
     @property
     def seed(self) -> int:
-        return next(iter(self.parts.values())).adapter.seed
+        return self.part.adapter.seed
+
+    @property
+    def part(self) -> ExternalEncoder:
+        """The encoder, as one of the modalities that it reads has it."""
+        return next(iter(self.parts.values()))
 
     def sides(self, modality: str) -> tuple[int, int]:
-        side = max(self.parts[modality].preprocessing.size)
+        side = max(self.part.preprocessing.size)
         return side, side
 
     def levels(self, modality: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        return self.parts[modality].preprocessing.mean, self.parts[modality].preprocessing.std
+        return self.part.preprocessing.mean, self.part.preprocessing.std
 
     @property
     def title(self) -> str:
         """Its name in tables; (NC): the licence allows no commercial use."""
-        return self.name + " (NC)" * any(is_noncommercial(part.loaded.licence) for part in self.parts.values())
+        return self.name + " (NC)" * is_noncommercial(self.part.loaded.licence)
 
     @property
-    def trained_on(self) -> tuple[str, ...]:
-        """What its encoders were trained on, as far as it is known; ("nothing",) for random weights."""
-        return tuple(dict.fromkeys(part.loaded.trained_on for part in self.parts.values()))
+    def trained_on(self) -> str:
+        """What it was trained on, as far as it is known; "nothing" for random weights."""
+        return self.part.loaded.trained_on
 
     def on(self, pack: Pack) -> "tuple[ExternalModel, Pack]":
         """This model and ``pack``, for each other.
@@ -96,33 +100,29 @@ class ExternalModel(Model):
         Raises:
             ValueError: If the data has no image that this model reads, or the windows that were asked for are impossible.
         """
-        parts = {m: part for m, part in self.parts.items() if m in pack.spec.modalities}
-        if not parts:
-            senses = f"{' and '.join(self.parts)}, {pack.spec.name!r} has {', '.join(pack.spec.modalities)}"
-            raise ValueError(f"{self.text} reads {senses}: give reads=touch, vision or both")
-        notes = []
-        wants = {m: part.preprocessing for m, part in parts.items()}
-        moving = {m: want for m, want in wants.items() if want.frames > 1}
-        if moving and not pack.spec.window.active:
+        senses = tuple(m for m in self.parts if m in pack.spec.modalities)
+        if not senses:
+            known = f"{' and '.join(self.parts)}, {pack.spec.name!r} has {', '.join(pack.spec.modalities)}"
+            raise ValueError(f"{self.text} reads {known}: give reads=touch, vision or both")
+        notes, want = [], self.part.preprocessing
+        if want.frames > 1 and not pack.spec.window.active:
             try:
-                want = next(iter(moving.values()))
-                pack = windowed(pack, Window(frames=want.frames, stride=want.stride, of=tuple(moving)))
+                pack = windowed(pack, Window(frames=want.frames, stride=want.stride, of=senses))
             except ValueError as error:
-                if any(parts[m].adapter.stride is not None for m in moving):
+                if self.part.adapter.stride is not None:
                     raise
                 notes.append(f"the current frame is repeated ({error})")
-        for modality, want in wants.items():
+        for modality in senses if want.offset is not None else ():
             window, sense = pack.spec.window, modality == "touch" and pack.spec.difference
-            if want.offset is not None and not (sense or (window.minus_first and modality in window.of)):
+            if not (sense or (window.minus_first and modality in window.of)):
                 notes.append(f"{modality}: its owner subtracts a background, this data has none: images as they are")
-        return ExternalModel(self.text, parts, pack.spec, pack.size, tuple(notes)), pack
+        return ExternalModel(self.text, self.part, pack.spec, pack.size, tuple(notes)), pack
 
     def untrained(self) -> "ExternalModel | None":
-        """The same networks with random weights, as a control; None where that is not possible."""
-        parts = {m: random for m, part in self.parts.items() if (random := part.untrained())}
-        if not parts:
+        """The same network with random weights, as a control; None where that is not possible."""
+        if (part := self.part.untrained()) is None:
             return None
-        made = ExternalModel(self.text, parts, self.spec, self.stored)
+        made = ExternalModel(self.text, part, self.spec, self.stored)
         made.name = f"{self.name}, untrained"
         return made
 
@@ -173,5 +173,4 @@ def is_noncommercial(licence: str) -> bool:
 
 def open_model(text: str) -> ExternalModel:
     """Open the encoder that ``text`` names; ValueError if there is none."""
-    part = open_encoder(text)
-    return ExternalModel(text, {m: part for m in MODALITIES if part.adapter.reads in (m, "both")})
+    return ExternalModel(text, open_encoder(text))
