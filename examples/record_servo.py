@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.control.find import find_suite
+from mvitac.control.result import find_suite
 from mvitac.control.servo import SIZE, STEP_MM, task_of
 from mvitac.data.build import build
 from mvitac.data.source import Sample, Source

@@ -13,7 +13,7 @@ from PIL import Image
 
 from mvitac.cli.main import main
 from mvitac.control.ablate import Recorded, ablate, act, open_policy, read_episodes, suite_episodes, suite_policy
-from mvitac.control.find import find_suite
+from mvitac.control.result import find_suite
 from mvitac.control.video import encoded, film
 from mvitac.data.build import build
 from mvitac.data.pack import Pack

@@ -13,9 +13,9 @@ import pytest
 from mvitac.bench.encoder import About
 from mvitac.bench.result import VOLATILE
 from mvitac.control import result
-from mvitac.control.find import find_suite
 from mvitac.control.insert import Insert, Insertion
 from mvitac.control.learn import ridge
+from mvitac.control.result import find_suite
 from mvitac.control.suite import Row, score
 from mvitac.system.files import digest
 

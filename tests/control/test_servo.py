@@ -14,7 +14,7 @@ from mvitac.bench.external import open_model
 from mvitac.bench.result import VOLATILE
 from mvitac.cli.main import main
 from mvitac.control import result
-from mvitac.control.find import find_suite
+from mvitac.control.result import find_suite
 from mvitac.control.servo import TASKS, Edge, Surface, presses, task_of, textures
 from mvitac.control.servo_rows import Condition, Episode, Servo
 from mvitac.control.suite import Row, rows_of, score

@@ -8,7 +8,7 @@ from tyro.conf import Positional
 from mvitac.cli.options import check_json, parse, printed_to, save_json
 from mvitac.control.ablate import PLAUSIBLE, open_policy, read_episodes, report, suite_episodes, suite_policy
 from mvitac.control.ablate import ablate as compare
-from mvitac.control.find import find_suite, shipped
+from mvitac.control.result import find_suite, shipped
 from mvitac.control.video import encoded, film
 from mvitac.data.pack import Pack
 from mvitac.system.progress import shown

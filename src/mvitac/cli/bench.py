@@ -12,7 +12,6 @@ from mvitac.bench.encoder import About, run_bench
 from mvitac.bench.result import problems, read_result, records_of
 from mvitac.bench.suite import find_suite, shipped
 from mvitac.cli.options import parse
-from mvitac.control import find
 from mvitac.control import result as loop
 from mvitac.evaluation.leaks import leaks_of
 from mvitac.evaluation.scores import summarise
@@ -61,13 +60,13 @@ _MANUAL = """Score an encoder on every task of a suite, beside the same controls
 def bench(argv: list[str]) -> None:
     """mvitac bench MODEL... --suite NAME [--out DIR] [--data-root DIR]"""
     options = parse(
-        _Options, argv, "bench", description=_MANUAL.format(suites=", ".join([*shipped(), *find.shipped()]))
+        _Options, argv, "bench", description=_MANUAL.format(suites=", ".join([*shipped(), *loop.shipped()]))
     )
     if not options.models:
         raise ValueError("name the encoder: the folder of a run or an artifact (see mvitac bench --help)")
-    if options.suite in find.shipped():
+    if options.suite in loop.shipped():
         with shown():
-            path = loop.run_suite(options.models, find.find_suite(options.suite), options.out, options.about)
+            path = loop.run_suite(options.models, loop.find_suite(options.suite), options.out, options.about)
         loop.print_result(path)
         print(f"written: {path}")
         return

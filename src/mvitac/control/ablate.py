@@ -51,12 +51,13 @@ class Episodes:
     rows: Sequence[np.ndarray] = ()  # those of each episode; of a suite, ``ablate`` fills both in
     actions: np.ndarray | None = None  # demonstrated, [N, T], episode after episode
     touched: np.ndarray | None = None  # bool [N]
-    lost: Callable[[Any], float] = lambda world: 0.0
     unit: str = "standard deviations of the action"  # of the error
 
 
 class Recorded:
     """An episode of a pack as a world: what a policy does changes nothing."""
+
+    loss = 0.0
 
     def __init__(self, pack: Pack, rows: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
         self.pack, self.rows, self.all, self.steps = pack, rows, values, 0
@@ -110,7 +111,7 @@ def suite_episodes(suite: Any, cell: tuple[str, ...]) -> Episodes:
     if cell not in suite.cells(OWN):
         raise unknown(f"task and condition of {suite.name}", "/".join(cell), map("/".join, suite.cells(OWN)))
     begin = [partial(suite.world, *cell, number) for number in range(suite.num)]
-    return Episodes(begin, begin[0]().senses, lost=lambda world: suite.lost(world.result()), unit=suite.failure)
+    return Episodes(begin, begin[0]().senses, unit=suite.failure)
 
 
 def suite_policy(suite: Any, cell: tuple[str, ...], text: str) -> Policy:
@@ -179,7 +180,7 @@ def act(
     Without a policy, of one that knows the truth. ``watch`` is called in each step, before the action.
     """
     replaced = replacement(kind, episodes.images[sense], episodes.rows) if kind else None
-    actions, lost, lengths = [], [], []
+    actions, losses, lengths = [], [], []
     for number, begin in enumerate(episodes.begin):
         getattr(policy, "reset", lambda: None)()
         world, seen, step = begin(), deque(maxlen=LAG + 1), 0
@@ -197,9 +198,9 @@ def act(
             actions.append(action)
             world.step(action)
             step += 1
-        lost += [episodes.lost(world)] * step
+        losses += [world.loss] * step
         lengths.append(step)
-    return np.stack(actions), np.array(lost), np.split(np.arange(len(lost)), np.cumsum(lengths)[:-1])
+    return np.stack(actions), np.array(losses), np.split(np.arange(len(losses)), np.cumsum(lengths)[:-1])
 
 
 def replacement(kind: str, images: Any, rows: Sequence[np.ndarray]) -> Callable[[int, int, np.ndarray], np.ndarray]:

@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from mvitac.control.find import find_suite
+from mvitac.control.result import find_suite
 
 
 class LoopEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):

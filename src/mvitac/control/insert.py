@@ -99,6 +99,10 @@ class Insertion:
         return abs(1000 * float(tip[0]) - self.slot_mm), abs(math.degrees(math.atan2(float(up[0]), float(up[2]))))
 
     @property
+    def loss(self) -> float:
+        return 1 - self.result()[0]
+
+    @property
     def reward(self) -> float:
         return self.over * self.result()[0]
 
@@ -267,9 +271,6 @@ class Insert(LoopSuite):
         (images, actions), num = self.recorded, int(lesson[1])
         given, steps = {sense: images[sense] for sense in SENSES[lesson[0]]}, ALIGN + DOWN
         return given, actions[: num * steps], max(2, num // 5) * steps
-
-    def lost(self, result: Sequence[float]) -> float:
-        return 1 - result[0]
 
     def impossible(self, task: str, n: np.ndarray, sums: np.ndarray) -> bool:
         """Whether no episodes give these sums [3, episodes]: success needs a small error."""

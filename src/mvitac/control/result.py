@@ -6,6 +6,7 @@
 The row that needs no picture, of the true pose or the expert, is computed again when a result is checked.
 """
 
+import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,13 @@ from mvitac.bench.encoder import About, measure
 from mvitac.bench.result import problems_of, read_signed
 from mvitac.bench.score import kept_part
 from mvitac.control.ablate import suite_episodes
-from mvitac.control.find import Suite, find_suite, shipped
+from mvitac.control.insert import Insert
+from mvitac.control.servo_rows import Servo
 from mvitac.control.suite import OWN, SHUFFLED, TUNED, Row, rows_of, score
 from mvitac.control.video import encoded, film
 from mvitac.evaluation.intervals import paired_difference
 from mvitac.model import Model
+from mvitac.registry import from_json, unknown
 from mvitac.report.html import blocks as page
 from mvitac.report.html import data_uri
 from mvitac.system.files import digest, fields_of, read_json, write_atomic
@@ -29,7 +32,22 @@ from mvitac.system.progress import work
 from mvitac.system.provenance import provenance
 
 FORM = "mvitac-control", 1
+SUITES = Path(__file__).parent / "suites"
+Suite = Servo | Insert
 Scored = dict[str, dict[tuple[str, str], list[dict[str, Any]]]]  # source -> task, condition -> cells of its seeds
+
+
+def shipped() -> list[str]:
+    """Names of the closed-loop suites of this version."""
+    return sorted(path.stem for path in SUITES.glob("*.toml"))
+
+
+def find_suite(name: str) -> Suite:
+    """The suite ``name`` of this version."""
+    if name not in shipped():
+        raise unknown("suite", name, shipped())
+    value = tomllib.loads((SUITES / f"{name}.toml").read_text())
+    return from_json(Insert if value["kind"] == "insert" else Servo, value, "suite")
 
 
 def run_suite(places: Sequence[str], suite: Suite, out: Path, about: About) -> Path:

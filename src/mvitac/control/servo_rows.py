@@ -99,9 +99,6 @@ class Servo(LoopSuite):
     def look(self, worlds: Sequence[Any], sense: str) -> np.ndarray:
         return np.stack(list(_processes().map(picture, [world.moment for world in worlds], chunksize=5)))
 
-    def lost(self, result: Sequence[float]) -> float:
-        return result[0] / self.scored
-
     def impossible(self, task: str, n: np.ndarray, sums: np.ndarray) -> bool:
         """Whether no episodes give these sums [3, shapes]: steps without contact have the limit."""
         mm, deg, lost = sums
@@ -165,6 +162,10 @@ class Episode:
         """Distance from the target; the limits once contact is lost."""
         away = self.task.limit if self.lost else np.abs(self.pose - self.task.target)
         return float(away[0]), float(np.hypot.reduce(away[1:]))
+
+    @property
+    def loss(self) -> float:
+        return self.sums[0] / self.suite.scored
 
     @property
     def reward(self) -> float:
