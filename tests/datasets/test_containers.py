@@ -18,7 +18,6 @@ from PIL import Image
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.folder import FolderConfig
-from mvitac.datasets.hub import HubConfig
 from mvitac.datasets.lerobot.reader import LeRobotConfig, choose
 from mvitac.datasets.table.clocks import nearest
 from mvitac.datasets.table.table import RowsConfig
@@ -233,12 +232,12 @@ def test_webdataset_hub_and_manifests_read_values(tmp_path: Path) -> None:
     config = WebDatasetConfig(path=tars, size=16, allow_missing=True, values=("pose=pose[1]:mm,force:N",))
     values, shown = measured(packed(config, tmp_path / "w"))
     assert np.allclose(values, np.stack([shown / 4, shown / 2], axis=1))
-    hub = HubConfig(path=make_hub(tmp_path / "hub"), size=16, vision="photo", values=("both=depth:mm,pose[2]:deg",))
+    hub = FolderConfig(path=make_hub(tmp_path / "hub"), size=16, vision="photo", values=("both=depth:mm,pose[2]:deg",))
     values, shown = measured(packed(hub, tmp_path / "h"))
     number = np.where(shown == 104, np.nan, shown - 100)
     assert np.array_equal(values, np.stack([number / 8, number / 4], axis=1), equal_nan=True)
     with pytest.raises(ValueError, match="'pose\\[1\\]' has fewer than two different values"):
-        HubConfig(path=tmp_path / "hub", size=16, vision="photo", values=("pose[1]:mm",)).source()
+        FolderConfig(path=tmp_path / "hub", size=16, vision="photo", values=("pose[1]:mm",)).source()
 
     rows = [{"vision": f"{i}.png", "pose": [i / 2, None, -i / 4]} for i in range(12)]
     for i in range(12):
@@ -339,7 +338,7 @@ def make_hub(root: Path) -> Path:
 
 def test_image_parquet_of_the_hub(tmp_path: Path) -> None:
     root = make_hub(tmp_path / "data")
-    config = HubConfig(path=root, size=16, labels=("kind",), group="thing", vision="photo")
+    config = FolderConfig(path=root, size=16, labels=("kind",), group="thing", vision="photo")
     pack = packed(config, tmp_path / "pack")
     assert pack.num == 30
     assert pack.spec.tasks[0].classes == ("metal", "wood")
@@ -361,7 +360,10 @@ def test_the_scale_of_16_bits_holds_inside_tars_and_parquet(tmp_path: Path) -> N
             rows.append({"touch": buffer.getvalue(), "thing": i})
     pq.write_table(pa.Table.from_pylist(rows), tmp_path / "a.parquet")
     options: dict[str, Any] = {"range": ("touch=0:200",), "size": 16}
-    tar, hub = WebDatasetConfig(path=tmp_path / "a.tar", **options), HubConfig(path=tmp_path / "a.parquet", **options)
+    tar, hub = (
+        WebDatasetConfig(path=tmp_path / "a.tar", **options),
+        FolderConfig(path=tmp_path / "a.parquet", **options),
+    )
     for config in (tar, hub):
         pack = packed(config, tmp_path / config.name)
         assert np.abs(pack.images["touch"][:, 8, 8, 0] - 12.75 * np.arange(20)).max() <= 0.5
@@ -377,13 +379,13 @@ def test_a_table_shows_no_image_of_other_folders(tmp_path: Path) -> None:
         rows = [{"touch": {"bytes": None if i == 3 else png(i), "path": name}, "kind": i % 2} for i in range(20)]
         pq.write_table(pa.Table.from_pylist(rows), link.parent / "d.parquet")
         with pytest.raises(ValueError, match=r"1 of 20 samples .*row 3 touch holds no image"):
-            packed(HubConfig(path=link.parent / "d.parquet", labels=("kind",), size=16), tmp_path / "pack")
+            packed(FolderConfig(path=link.parent / "d.parquet", labels=("kind",), size=16), tmp_path / "pack")
 
 
 def test_a_bad_cell_costs_its_own_row_only(tmp_path: Path) -> None:
     rows = [{"touch": b"no picture" if i == 3 else png(i), "kind": i % 2} for i in range(20)]
     pq.write_table(pa.Table.from_pylist(rows), tmp_path / "bad.parquet")
-    source = HubConfig(path=tmp_path / "bad.parquet", labels=("kind",), size=16).source()
+    source = FolderConfig(path=tmp_path / "bad.parquet", labels=("kind",), size=16).source()
     with pytest.raises(
         ValueError, match=r"1 of 20 samples cannot be read, first row 4: .*bad\.parquet row group 0 row 3"
     ):
@@ -398,8 +400,8 @@ def test_hub_files_name_their_split_all_or_none(tmp_path: Path) -> None:
     options: dict[str, Any] = {"path": root, "size": 16, "labels": ("kind",), "group": "thing"}
     (root / "train-00001-of-00002.parquet").rename(root / "more.parquet")
     with pytest.raises(ValueError, match=r"column 'split' \(split\) is empty"):
-        HubConfig(**options).source()
-    assert HubConfig(**options, split="by-group").source().spec().group_by == "thing"
+        FolderConfig(**options).source()
+    assert FolderConfig(**options, split="by-group").source().spec().group_by == "thing"
 
 
 def test_hub_parquet_with_gaps(tmp_path: Path) -> None:
@@ -408,6 +410,6 @@ def test_hub_parquet_with_gaps(tmp_path: Path) -> None:
     pq.write_table(pa.Table.from_pylist(rows), tmp_path / "gaps.parquet")
     options: dict[str, Any] = {"labels": ("kind",), "vision": "photo", "touch": ("obs.touch",), "size": 16}
     with pytest.raises(ValueError, match=r"row 4 has no obs\.touch path"):
-        HubConfig(path=tmp_path / "gaps.parquet", **options).source()
-    pack = packed(HubConfig(path=tmp_path / "gaps.parquet", allow_missing=True, **options), tmp_path / "pack")
+        FolderConfig(path=tmp_path / "gaps.parquet", **options).source()
+    pack = packed(FolderConfig(path=tmp_path / "gaps.parquet", allow_missing=True, **options), tmp_path / "pack")
     assert (~pack.has("touch")).sum() == 1 and level(pack.images["vision"][~pack.has("touch")]) == 3

@@ -251,14 +251,13 @@ def test_unlabelled_rows_are_kept_for_pre_training_only(tmp_path: Path, rows: Ta
     assert (labels[pack.rows("unlabelled")] == -1).all()
 
 
-def test_controls_are_numbers_or_one_hot(tmp_path: Path, rows: Table) -> None:
-    options = config(write(rows, tmp_path / "m.csv"), controls=("how wide=width", "mixed=width,side"))
-    pack = packed(options, tmp_path / "pack")
-    assert pack.spec.controls == {"how wide": ("width",), "mixed": ("width", "side=test", "side=train", "side=val")}
+def test_controls_are_numbers(tmp_path: Path, rows: Table) -> None:
+    file = write(rows, tmp_path / "m.csv")
+    pack = packed(config(file, controls=("how wide=width", "both=width,seq")), tmp_path / "pack")
+    assert pack.spec.controls == {"how wide": ("width",), "both": ("width", "seq")}
     assert pack.column("width").tolist() == [row["width"] for row in rows]
-    one_hot = np.stack([pack.column(c) for c in pack.spec.controls["mixed"][1:]], axis=1)
-    assert (one_hot.sum(1) == 1).all()
-    assert ((one_hot[:, 0] == 1) == (pack.column("side") == "test")).all()
+    with pytest.raises(ValueError, match=r"row 1 .*control column 'side' is 'train', not a number"):
+        config(file, controls=("x=side",)).source()
 
 
 def test_has_touch_is_seen_not_believed(tmp_path: Path, rows: Table) -> None:
@@ -537,13 +536,13 @@ BAD: dict[str, tuple[Change | None, dict[str, Any], str]] = {
     "nothing to test": (
         each(side="train"),
         {"split": "side"},
-        r"'side' gives label 'material' no labelled rows in test",
+        r"'side' gives label 'material' no rows in test",
     ),
-    "one group": (each(object="a"), {}, r"assigning 1 groups gives label 'material' no labelled rows in test"),
+    "one group": (each(object="a"), {}, r"assigning 1 groups gives label 'material' no rows in test"),
     "control with gaps": (
         one(4, width=""),
         {"controls": ("w=width",)},
-        r"row 4 .*control column 'width' is empty",
+        r"row 4 .*control column 'width' is '', not a number",
     ),
     "id twice": (each(id="a"), {}, r"id 'a' occurs in several rows"),
     "vision is touch": (

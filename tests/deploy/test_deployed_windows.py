@@ -60,7 +60,7 @@ def test_a_clip_is_read_as_the_packs_window(model: Model, measured: Pack) -> Non
 def test_other_than_clips_are_refused(model: Model) -> None:
     image = np.zeros((32, 32, 3), np.uint8)
     for given in (image, Image.fromarray(image), np.stack([image] * 3), [image]):
-        with pytest.raises(ValueError, match=r"looks at 2 frames at once, got .*: give clips \[2, H"):
+        with pytest.raises(ValueError, match=r"looks at 2 frames, got .*: give clips \[2, H"):
             model.embed(touch=given)
 
 

@@ -14,7 +14,7 @@ from mvitac.data.spec import DataSpec
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.registry import from_json, to_json
 from mvitac.sim import gel
-from mvitac.sim.gel import GEL_STIFFNESS, area_resize, contact, press, pressure, relax, render
+from mvitac.sim.gel import GEL_STIFFNESS, area_resize, contact, press, pressure, render
 from mvitac.sim.materials import CLASSES, draw_instance, touch
 from mvitac.sim.relief import KINDS, Relief, draw_tables, noise
 from mvitac.sim.sensors import SENSORS, random_sensors
@@ -42,13 +42,6 @@ def test_an_item_depends_on_its_numbers_alone():
     assert other.stdout.strip() == first
     items = [(0, 0, 0, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)]
     assert len({digest(touch(*item, size=32)) for item in items}) == len(items)
-
-
-def test_touches_share_the_instance():
-    first, second = touch(0, 4, 1, 0, size=32), touch(0, 4, 1, 1, size=32)
-    shared = ("category", "soft", "rough", "stiffness", "wavelength_mm", "amplitude_mm", "asperity", "gloss")
-    assert all(first[name] == second[name] for name in shared)
-    assert first["force_n"] != second["force_n"]
 
 
 @pytest.mark.parametrize("size", [16, 72, 256])
@@ -130,13 +123,6 @@ def test_measuring_the_contact_changes_no_picture():
     assert new == {"depth_mm": "mm", "contact_x_mm": "mm", "contact_y_mm": "mm", "patch_mm2": "mm2"}
     assert other.columns.keys() - one.columns.keys() == set(new)
     assert {**other.columns, **one.columns} == other.columns
-
-
-def test_the_membrane_only_adds():
-    indent = np.maximum(np.random.default_rng(0).normal(0, 0.1, (64, 64)), 0).astype(np.float32)
-    smooth = np.full((64, 64), 0.3, np.float32)
-    assert relax(indent, pixel_mm=0.1).mean() >= indent.mean()
-    np.testing.assert_allclose(relax(smooth, pixel_mm=0.1), smooth, atol=1e-6)
 
 
 @pytest.mark.parametrize("sensor", [*SENSORS.values()], ids=lambda s: s.name)
@@ -277,8 +263,6 @@ def test_packs_say_which_sensor_pressed():
     [
         ({"makes": ("mimi",)}, "unknown sensor 'mimi'.*did you mean 'mini'"),
         ({"sensors": 5, "held_out_sensor": True}, "leave out makes and sensors"),
-        ({"sensors": -1}, "sensors -1: give 0 to 10000"),
-        ({"sensors_per_press": 5}, "give 1 to 4"),
         ({"held_out_sensor": True, "sensors_per_press": 2}, "give 1 to 1"),
     ],
 )

@@ -10,7 +10,7 @@ from tabulate import tabulate
 from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, parse, printed_to, save_json, selectors
-from mvitac.data.checks.examine import Draw, examine_open, examine_pack, examine_source, nothing
+from mvitac.data.checks.examine import Draw, examine_open, examine_pack, examine_source
 from mvitac.data.checks.finding import Finding, exit_code
 from mvitac.data.pack import Pack
 from mvitac.datasets.base import DatasetConfig, dataset
@@ -75,11 +75,11 @@ def check(argv: list[str]) -> int:
     return _report(name, examine_source(source, **asked), options)
 
 
-def _sheet(what: str, options: _Options) -> Draw:
+def _sheet(what: str, options: _Options) -> Draw | None:
     """What draws the contact sheet that ``options`` ask for; ValueError if their files cannot be written."""
     check_json(options.json)
     if not (out := options.sheet):
-        return nothing
+        return None
     check_place(out)
 
     def sheet(pack: Pack, findings: Sequence[Finding]) -> None:

@@ -31,7 +31,7 @@ class JoinedPack(Several):
             if any(num for _, num in shapes) and shapes[0] != shapes[1]:
                 each = [f"{num} channels at {size} px" for size, num in shapes]
                 raise ValueError(
-                    f"{modality} has {each[0]} in {learn.path} and {each[1]} in {score.path}: pack both alike"
+                    f"{modality} has {each[0]} in {learn.path}, {each[1]} in {score.path}: pack both alike"
                 )
         tasks = _common_tasks(learn, score)
         learned = _side(learn, tasks, "learned", {"train", "val"})

@@ -75,9 +75,7 @@ class Jpegs(Lazy):
             try:
                 images[i] = decode(self._file[self._ends[row] : self._ends[row + 1]].tobytes(), self.shape[1:])
             except ValueError as error:
-                raise ValueError(
-                    f"{self.path}: row {row} cannot be decoded ({brief(error)}): the pack is damaged, make it again"
-                ) from None
+                raise ValueError(f"{self.path}: row {row} cannot be decoded ({brief(error)}): pack again") from None
 
 
 def _num_threads() -> int:

@@ -125,9 +125,7 @@ def _check(parts: Mapping[str, Pack]) -> dict[str, int]:
         channels[modality] = next(iter(given.values()), 0)
     minus = {pack.spec.difference: name for name, pack in parts.items() if pack.spec.touch_channels}
     if len(minus) > 1:
-        raise ValueError(
-            f"touch is stored minus its background in {minus[True]} and as it is in {minus[False]}: pack both alike"
-        )
+        raise ValueError(f"touch is minus its background in {minus[True]} and not in {minus[False]}: pack both alike")
     return channels
 
 

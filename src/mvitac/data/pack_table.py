@@ -51,9 +51,7 @@ def _first(bad: np.ndarray) -> int:
 
 def _check_labels(column: pa.ChunkedArray, name: str, num: int) -> None:
     if not pa.types.is_integer(column.type):
-        raise ValueError(
-            f"column {name} holds {column.type}: a label is a whole number, 0 to {num - 1}, or -1 for none"
-        )
+        raise ValueError(f"column {name} holds {column.type}: a label is 0 to {num - 1}, or -1 for none")
     values = column.to_numpy()
     if (bad := (values < -1) | (values >= num)).any():
         row = _first(bad)

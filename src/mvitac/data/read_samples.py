@@ -124,9 +124,8 @@ def read_parts(
             while ahead:
                 yield ahead.popleft().result()
         except BrokenProcessPool:
-            raise ValueError(
-                "a packing process died: out of memory, or a script without `if __name__ == '__main__':` (or give workers 1)"
-            ) from None
+            why = "out of memory, or a script without `if __name__ == '__main__':` (or give workers 1)"
+            raise ValueError(f"a packing process died: {why}") from None
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 

@@ -213,9 +213,7 @@ def _opened(path: str | Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     except FFmpegError as error:
         if isinstance(error, OSError) and not isinstance(error, ValueError):
             raise OSError(error.errno, error.strerror, str(path)) from None
-        raise ValueError(
-            f"{path} cannot be read as a video ({_reason(error)}): it is damaged or cut off, fetch it again"
-        ) from None
+        raise ValueError(f"{path} cannot be read as a video ({_reason(error)}): it is damaged or cut off") from None
 
 
 def _reason(error: FFmpegError) -> str:

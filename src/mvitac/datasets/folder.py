@@ -1,4 +1,4 @@
-"""``--data folder``: your own images, in a table, HDF5 files, videos or folders.
+"""``--data folder``: your own images, in a table, parquet, HDF5 or zarr files, videos or folders.
 
 A **manifest** (.csv, .parquet or .jsonl) has one row per sample; its paths are relative to its own folder, or absolute:
 
@@ -7,6 +7,8 @@ A **manifest** (.csv, .parquet or .jsonl) has one row per sample; its paths are 
 
 A path may be a **video**; column ``frame`` (or ``touch_frame``, ``vision_frame``, ...) then holds the frame number, from
 0. Each video is decoded once, and is one group unless a column gives the groups.
+
+A **parquet file** may hold the images themselves (``mvitac.datasets.table.parquet``).
 
 **Class folders** need no manifest. Files are paired by their path inside the modality's folder, without the suffix:
 
@@ -45,6 +47,7 @@ from mvitac.datasets.table.arrays import read_arrays
 from mvitac.datasets.table.folders import list_images, list_videos, to_train
 from mvitac.datasets.table.image_refs import ARRAYS
 from mvitac.datasets.table.manifest import READERS, Manifest, read_manifest
+from mvitac.datasets.table.parquet import read_parquet
 from mvitac.datasets.table.table import RecordedConfig
 
 
@@ -55,8 +58,8 @@ class FolderConfig(RecordedConfig):
     name: ClassVar[str] = "folder"
 
     path: Path = Path("data")
-    """A manifest (.csv, .parquet, .jsonl), an HDF5 or zarr file, a video; or a folder with manifest.*, of HDF5 or zarr
-    files, of videos, of class folders or of images."""
+    """A manifest (.csv, .parquet, .jsonl), a parquet file with images, an HDF5 or zarr file, a video; or a folder with
+    manifest.*, of files of these kinds, of class folders or of images."""
     pictures: Literal["touch", "vision"] = "touch"
     """Modality of images and videos that nothing names (<root>/<class>/*.jpg, <root>/*.mp4)."""
 
@@ -68,6 +71,10 @@ class FolderConfig(RecordedConfig):
         tables = [f for f in files if f.suffix.lower() in READERS and (f == self.path or f.stem == "manifest")]
         if len(tables) > 1:
             raise ValueError(f"{self.path} holds {' and '.join(f.name for f in tables)}: give the path of one of them")
+        parquet = tables if tables or alone else sorted(self.path.rglob("*.parquet"))
+        parquet = [file for file in parquet if file.suffix.lower() == ".parquet"]
+        if parquet and (images := read_parquet(self.path, parquet, self.vectors())):
+            return images
         if tables:
             return read_manifest(tables[0])
         if arrays := [file for file in files if file.name.lower().endswith(ARRAYS)]:

@@ -24,10 +24,11 @@ CONTACT = {"depth": ["depth_mm"], "position": ["contact_x_mm", "contact_y_mm"], 
 """Tasks of option ``contact`` and their columns."""
 
 
-def _targets(columns: Sequence[str]) -> tuple[Target, ...]:
-    """Return the targets of columns that end in their unit."""
+def value_task(name: str, columns: Sequence[str], **about: Any) -> ValueTask:
+    """Return the task of columns that end in their unit."""
     units = {"n": "N", "mm": "mm", "mm2": "mm2"}
-    return tuple(Target(name=column, unit=units[column.rpartition("_")[2]]) for column in columns)
+    targets = tuple(Target(name=column, unit=units[column.rpartition("_")[2]]) for column in columns)
+    return ValueTask(name=name, targets=targets, **about)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,8 +138,8 @@ class Materials(Source):
                 Task(name="rough", classes=("smooth", "rough")),
             ),
             values=(
-                ValueTask(name="force", targets=(Target(name="force_n", unit="N"),)),
-                *([ValueTask(name=task, targets=_targets(CONTACT[task])) for task in CONTACT] * self.config.contact),
+                value_task("force", ["force_n"]),
+                *([value_task(task, CONTACT[task]) for task in CONTACT] * self.config.contact),
             ),
             group_by="instance",
             licence=LICENCE,
@@ -203,7 +204,7 @@ class Grasps(Source):
         self.config = config
 
     def spec(self) -> DataSpec:
-        known = {"normal force": ["normal_n"]}
+        known, during = {"normal force": ["normal_n"]}, {"phase": "during"}
         if self.config.contact:
             known |= {**CONTACT, "shear force": ["shear_x_n", "shear_y_n"]}
         return DataSpec(
@@ -211,13 +212,9 @@ class Grasps(Source):
             vision_channels=3,
             touch_channels=6,
             # 'after' shows the outcome, so only 'during' (fingers closed, before the lift) has the label.
-            tasks=(Task(name="success", classes=("failure", "success"), only={"phase": "during"}),),
+            tasks=(Task(name="success", classes=("failure", "success"), only=during),),
             values=tuple(
-                ValueTask(
-                    name=task,
-                    targets=_targets([grasps.side_name(name, side) for name in names for side in ("left", "right")]),
-                    only={"phase": "during"},
-                )
+                value_task(task, [grasps.side_name(n, side) for n in names for side in ("left", "right")], only=during)
                 for task, names in known.items()
             ),
             group_by="object",

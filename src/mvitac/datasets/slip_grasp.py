@@ -60,10 +60,7 @@ def _grasps(root: Path, file: Path) -> list[dict[str, str]]:
         if not words:
             continue
         if len(words) != 8 or words[2] not in ("0", "1"):
-            raise ValueError(
-                f"{file} line {number}: {line!r} is not a grasp (width, outcome, 1 or 0, first, last, key frame, folder,"
-                " infix)"
-            )
+            raise ValueError(f"{file} line {number}: {line!r} is not a grasp of eight words")
         width, _, success, _, _, key, folder, _ = words
         pairs: dict[int, dict[str, str]] = defaultdict(dict)
         for path in sorted((root / f"object{name}" / f"{folder}_mm").glob("*.jpg")):

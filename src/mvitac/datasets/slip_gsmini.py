@@ -55,9 +55,7 @@ class SlipGSMiniConfig(RowsConfig):
         for folders in copies.values():
             rows += self._recording(root, folders)
         if not rows:
-            raise ValueError(
-                f"{root} has no folder exp_num_* with both {' and '.join(FINGERS.values())}: clone it whole"
-            )
+            raise ValueError(f"{root} has no folder with both {' and '.join(FINGERS.values())}: clone it whole")
         often: dict[str, list[int]] = {}
         for row in rows:
             often.setdefault(row["object"], []).append(int(row["slip"] or 0))

@@ -18,8 +18,8 @@ import numpy as np
 
 from mvitac.data.images import difference
 from mvitac.data.source import Sample, Source
-from mvitac.data.spec import DataSpec, Target, ValueTask
-from mvitac.datasets.simulated import LICENCE, PressConfig
+from mvitac.data.spec import DataSpec
+from mvitac.datasets.simulated import LICENCE, PressConfig, value_task
 from mvitac.sim import ball, measured
 from mvitac.sim.sensors import MEASURED
 
@@ -60,10 +60,7 @@ class Taxim(Source):
             vision_channels=0,
             touch_channels=3,
             tasks=(),
-            values=tuple(
-                ValueTask(name=name, targets=tuple(Target(name=column, unit="mm") for column in columns))
-                for name, columns in TASKS.items()
-            ),
+            values=tuple(value_task(name, columns) for name, columns in TASKS.items()),
             group_by="contact",
             licence="MIT" if real else LICENCE,
             source="package taxim" if real else f"mvitac.sim.ball version {ball.VERSION}",

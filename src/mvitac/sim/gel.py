@@ -48,10 +48,6 @@ def pressure(
     Object and gel are springs in series at every pixel. The approach that balances the force is exact: with sorted gaps,
     pressure is linear in the approach between two neighbouring gaps.
     """
-    if relief_mm.ndim != 2:
-        raise ValueError(f"relief_mm must be [H, W], got shape {relief_mm.shape}: pass one height map in mm")
-    if force_n < 0 or stiffness <= 0 or pixel_mm <= 0:
-        raise ValueError(f"need force_n >= 0 and stiffness, pixel_mm > 0, got {force_n=}, {stiffness=}, {pixel_mm=}")
     if force_n == 0:
         return np.zeros(relief_mm.shape, np.float32)
     height = np.array(relief_mm, np.float64)
@@ -100,9 +96,8 @@ def contact(
     Returns "depth_mm", the deepest indentation of the gel; "contact_x_mm" and "contact_y_mm", the centre of pressure,
     right and down from the middle of the picture (NaN without contact); "patch_mm2", the area under pressure.
     """
-    p = pressure(
-        relief_mm, force_n=force_n, stiffness=stiffness, pixel_mm=pixel_mm, dome_radius_mm=dome_radius_mm
-    ).astype(np.float64)
+    spring = {"stiffness": stiffness, "pixel_mm": pixel_mm, "dome_radius_mm": dome_radius_mm}
+    p = pressure(relief_mm, force_n=force_n, **spring).astype(np.float64)
     if not (total := float(p.sum())):
         return dict(zip(KNOWN, (0.0, math.nan, math.nan, 0.0), strict=True))
     x, y = ((np.arange(n) - (n - 1) / 2) * pixel_mm for n in (p.shape[1], p.shape[0]))
@@ -131,12 +126,8 @@ def render(
             several pictures with the same copy.
         gain: Factor of the colour response to slope (LED current, paint).
     """
-    if imprint_mm.ndim != 2:
-        raise ValueError(f"imprint_mm must be [H, W], got shape {imprint_mm.shape}: pass the result of press()")
     if unit is None:
         unit = int(rng.integers(2**31))
-    if unit < 0:
-        raise ValueError(f"unit must be a number >= 0 that names one copy of the sensor, got {unit}")
     # A copy has the same properties at every size.
     copy, paint = np.random.default_rng([_TAG, *sensor.name.encode(), unit]).spawn(2)
     imprint = imprint_mm.astype(np.float32)

@@ -76,10 +76,6 @@ def grasp(
         (``lift_mm``, ``unstable``) and the contact (``normal_*_n``, and ``contact_*``, the mean imprint of that gel in
         mm, a control).
     """
-    if not 0 <= obj < NUM_OBJECTS:
-        raise ValueError(f"obj must be in 0..{NUM_OBJECTS - 1}, got {obj}")
-    if index < 0 or seed < 0:
-        raise ValueError(f"seed and index must be 0 or larger, got seed {seed} and index {index}")
     if not 16 <= size <= 1024:
         raise ValueError(f"size must be in 16..1024 pixels, got {size}")
     bench, key = _bench(seed, obj), (seed, obj, index)

@@ -153,7 +153,10 @@ def touch(
     Returns:
         "vision" and "touch" (uint8 [size, size, 3]), "category", "soft", "rough" and the latents.
     """
-    _check_request(seed, category, instance, touch, size)
+    if not 0 <= category < len(CLASSES):
+        raise ValueError(f"category must be 0 to {len(CLASSES) - 1}, got {category}")
+    if not MIN_SIZE <= size <= MAX_SIZE:
+        raise ValueError(f"size must be {MIN_SIZE} to {MAX_SIZE} pixels, got {size}")
     thing = draw_instance(seed, category, instance)
     # One random stream per picture, so that they are independent; pixel noise is drawn last in each.
     pose, eye, finger = np.random.default_rng([_TAG, seed, category, instance, touch]).spawn(3)
@@ -181,16 +184,6 @@ def touch(
         "gloss": thing.gloss,
         "angle_rad": angle,
     }
-
-
-def _check_request(seed: int, category: int, instance: int, touch: int, size: int) -> None:
-    for name, value in (("seed", seed), ("instance", instance), ("touch", touch)):
-        if value < 0:
-            raise ValueError(f"{name} must be >= 0, got {value}")
-    if not 0 <= category < len(CLASSES):
-        raise ValueError(f"category must be 0 to {len(CLASSES) - 1} ({', '.join(CLASSES)}), got {category}")
-    if not MIN_SIZE <= size <= MAX_SIZE:
-        raise ValueError(f"size must be {MIN_SIZE} to {MAX_SIZE} pixels, got {size}")
 
 
 def _look(thing: Instance, rng: np.random.Generator, angle: float, place: Place, size: int) -> NDArray[np.uint8]:

@@ -76,9 +76,7 @@ def learn_colours(images: np.ndarray) -> GelColours:
     inner = curvature[:, height // 8 : -(height // 8), width // 8 : -(width // 8)]
     bend = np.tanh(skew(inner.reshape(len(images), -1), axis=1))
     if abs(t := bend.mean() / bend.std() * len(images) ** 0.5) < SURE:
-        raise ValueError(
-            f"{len(images)} images do not tell peaks from pits (t {t:.1f}): give more, of different presses"
-        )
+        raise ValueError(f"{len(images)} images do not tell peaks from pits (t {t:.1f}): give more presses")
     factor = -factor if t > 0 else factor
     return GelColours(level=level, rest=mean - level, colours=colours * factor, mixtures=mixtures / factor)
 

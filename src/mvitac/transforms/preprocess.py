@@ -80,10 +80,8 @@ class Preprocess:
             return [value[:, :, f * each : (f + 1) * each] for f in reversed(range(self.frames))]
         frames = [value] if _is_image(value) else list(value)
         if len(frames) != self.frames:
-            how = f"give clips [{self.frames}, H, W, {each}], oldest first, or lists of {self.frames} images"
-            raise ValueError(
-                f"{self.modality}: this model looks at {self.frames} frames at once, got {len(frames)}: {how}"
-            )
+            how = f"give clips [{self.frames}, H, W, {each}], oldest first"
+            raise ValueError(f"{self.modality}: this model looks at {self.frames} frames, got {len(frames)}: {how}")
         return frames
 
 

@@ -17,11 +17,7 @@ from mvitac.data.source import Lost, Sample, Source
 from mvitac.data.spec import DataSpec, Window
 
 SINGLE = Window()
-Draw = Callable[[Pack, Sequence[Finding]], None]
-
-
-def nothing(pack: Pack, findings: Sequence[Finding]) -> None:
-    """Draw no contact sheet."""
+Draw = Callable[[Pack, Sequence[Finding]], None]  # draws a contact sheet
 
 
 class ThumbnailSource(Source):
@@ -92,7 +88,7 @@ def examine(pack: Pack, *, part: bool = False, window: Window = SINGLE) -> list[
     ]
 
 
-def examine_pack(path: str | Path, window: Window = SINGLE, draw: Draw = nothing) -> list[Finding]:
+def examine_pack(path: str | Path, window: Window = SINGLE, draw: Draw | None = None) -> list[Finding]:
     """Check the pack at ``path``."""
     try:
         pack = Pack(path)
@@ -103,10 +99,11 @@ def examine_pack(path: str | Path, window: Window = SINGLE, draw: Draw = nothing
     return examine_open(pack, window, draw)
 
 
-def examine_open(pack: Pack, window: Window = SINGLE, draw: Draw = nothing) -> list[Finding]:
+def examine_open(pack: Pack, window: Window = SINGLE, draw: Draw | None = None) -> list[Finding]:
     """As ``examine_pack``, for a pack that is open."""
     findings = [Finding("pack", "ok", f"{pack.num} rows, every digest matches"), *examine(pack, window=window)]
-    draw(pack, findings)
+    if draw:
+        draw(pack, findings)
     return findings
 
 
@@ -118,7 +115,7 @@ def examine_source(
     workers: int = 1,
     quiet: bool = False,
     window: Window = SINGLE,
-    draw: Draw = nothing,
+    draw: Draw | None = None,
 ) -> list[Finding]:
     """Findings about ``source``, which is read into a temporary pack of ``size`` px, to ``draw`` while it is there.
 
@@ -132,5 +129,6 @@ def examine_source(
         findings = examine(pack, part=partly, window=window)
         read = f"{len(thumbnails.items())} of {len(source.items())} items examined, kept at {size} px"
         findings.insert(0, Finding("source", "ok", f"{pack.spec.name}: {read}"))
-        draw(pack, findings)
+        if draw:
+            draw(pack, findings)
         return findings

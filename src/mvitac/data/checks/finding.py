@@ -37,12 +37,6 @@ def exit_code(findings: Iterable[Finding]) -> int:
     return max(({"broken": 2, "look": 1}.get(finding.verdict, 0) for finding in findings), default=0)
 
 
-def some(names: Sequence[object], num: int = 3) -> str:
-    """Return the first ``num`` names and the number of others."""
-    shown = ", ".join(str(name) for name in names[:num])
-    return shown + (f" and {len(names) - num} more" if len(names) > num else "")
-
-
 def share(part: int, whole: int) -> str:
     """Return a text such as '12 of 340 (3.5 %)'."""
     return f"{part} of {whole} ({100 * part / max(1, whole):.1f} %)"

@@ -4,9 +4,10 @@ from functools import partial
 
 import numpy as np
 
-from mvitac.data.checks.finding import Finding, judged, share, some
+from mvitac.data.checks.finding import Finding, judged, share
 from mvitac.data.checks.image_stats import ImageStats
 from mvitac.data.pack import Pack
+from mvitac.data.spec import listed
 
 ORDER_COLUMNS = ("seq", "frame", "step", "time")  # columns that give the order of the rows of a group
 MAX_LAG = 5
@@ -83,7 +84,7 @@ def _where(pack: Pack, rows: np.ndarray) -> str:
             names, counts = np.unique(values[rows], return_counts=True)
             whole = [n for n, count in zip(names, counts, strict=True) if count >= 0.8 * (values == n).sum()]
             if whole and sum((values[rows] == n).sum() for n in whole) >= 0.8 * len(rows):
-                return f", whole {column}s: {some(whole)}"
+                return f", whole {column}s: {listed(whole, 3)}"
     return ""
 
 

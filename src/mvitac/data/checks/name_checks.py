@@ -7,9 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mvitac.data.checks.finding import Finding, judged, some
+from mvitac.data.checks.finding import Finding, judged
 from mvitac.data.checks.table_checks import KEYS, sides_of
 from mvitac.data.pack import Pack
+from mvitac.data.spec import listed
 
 MAX_SHOWN = 20
 
@@ -57,4 +58,4 @@ def _key(name: str) -> str:
 def _shown(alike: list[list[str]]) -> str:
     # ascii() shows what looks the same on the screen: Unicode forms, non-breaking blanks.
     quoted = [" and ".join(repr(n) if n.isprintable() and n.isascii() else ascii(n) for n in names) for names in alike]
-    return some(quoted, MAX_SHOWN)
+    return listed(quoted, MAX_SHOWN)

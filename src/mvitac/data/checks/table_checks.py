@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from mvitac.data.checks.finding import Finding, judged, share, some
+from mvitac.data.checks.finding import Finding, judged, share
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
-from mvitac.data.spec import UNGROUPED
+from mvitac.data.spec import UNGROUPED, listed
 
 KEYS = ("object", "instance", "recording", "video", "grasp", "experiment", "session", "sequence")
 """Columns whose values should not be in more than one split either, if the dataset has them."""
@@ -68,8 +68,8 @@ def class_balance(pack: Pack) -> list[Finding]:
         unseen, unasked = names[(test > 0) & (train == 0)].tolist(), names[test == 0].tolist()
         always = task.classes[train.argmax()]
         evidence = f"{len(names)} classes; always saying {always!r} scores {100 * majority:.1f} % on test"
-        evidence += f"; never tested: {some(unasked)}" if unasked else ""
-        evidence += f"; tested but never seen in training: {some(unseen)}" if unseen else ""
+        evidence += f"; never tested: {listed(unasked, 3)}" if unasked else ""
+        evidence += f"; tested but never seen in training: {listed(unseen, 3)}" if unseen else ""
         skewed = majority > 0.9 or (majority > 0.75 and len(names) > 2)
         advice = (
             "assign the groups to splits again, or drop the classes"
@@ -129,7 +129,7 @@ def leaks(pack: Pack) -> list[Finding]:
         broken = not notes.keys().isdisjoint(("group", "touch_group"))
         findings.append(judged(item, "; ".join(notes.values()) or none, advice, rows, look=bool(notes), broken=broken))
     if sound:
-        findings.append(Finding("groups across split columns", "ok", f"{some(sound, 8)}: {none}"))
+        findings.append(Finding("groups across split columns", "ok", f"{listed(sound, 8)}: {none}"))
     return findings
 
 
@@ -146,12 +146,12 @@ def mixture(pack: Pack) -> Finding:
         values = pack.column(column).astype(str)
         names, counts = np.unique(values[values != "None"], return_counts=True)  # None: rows without this image
         order = np.argsort(-counts)
-        notes.append(f"{column}: {some([f'{names[i]} {100 * counts[i] / pack.num:.0f} %' for i in order], 4)}")
+        notes.append(f"{column}: {listed([f'{names[i]} {100 * counts[i] / pack.num:.0f} %' for i in order], 4)}")
         if len(names) == 1:
             continue
         wrong += [f"several of {column}"] if column.endswith("_size") else []
         train, test = (set(values[pack.rows(split)].tolist()) for split in ("train", "test"))
-        wrong += [f"{column} {some(sorted(test - train))} only in test"] if test - train else []
+        wrong += [f"{column} {listed(sorted(test - train), 3)} only in test"] if test - train else []
         for task in pack.spec.tasks:
             labels = pack.labels(task.name, "train", "val", "test")
             counted = (labels >= 0) & (values != "None")

@@ -4,10 +4,10 @@ import re
 
 import numpy as np
 
-from mvitac.data.checks.finding import Finding, judged, share, some
+from mvitac.data.checks.finding import Finding, judged, share
 from mvitac.data.checks.image_stats import ImageStats
 from mvitac.data.pack import Pack
-from mvitac.data.spec import Target, ValueTask, Window
+from mvitac.data.spec import Target, ValueTask, Window, listed
 from mvitac.data.stamps import STAMPS, seconds
 from mvitac.data.windows import frames_of, places, recordings
 
@@ -83,7 +83,7 @@ def _unit(target: Target, known: np.ndarray, groups: np.ndarray) -> Note:
     odd = (sizes > 300 * usual) | ((sizes > 0) & (sizes < usual / 300))
     if len(names) >= 4 and usual > 0 and odd.any():
         times = sizes[odd][0] / usual
-        notes.append(f"values of {some(names[odd].tolist())} are about {times:.2g} times those of other groups")
+        notes.append(f"values of {listed(names[odd].tolist(), 3)} are about {times:.2g} times those of other groups")
     return "; ".join(notes), []
 
 

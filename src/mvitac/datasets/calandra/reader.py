@@ -185,9 +185,7 @@ def find_shards(path: Path, shards: Sequence[int]) -> list[Path]:
     missing = [number for number in shards if number not in files]
     if missing or not files:
         lacking = f"calandra_corl2017_{missing[0]:03d}.h5" if missing else "calandra_corl2017_NNN.h5"
-        raise ValueError(
-            f"{path} has no {lacking}: download it (doi 10.25532/OPARA-700) or give another path or shards"
-        )
+        raise ValueError(f"{path} has no {lacking}: download it (doi 10.25532/OPARA-700)")
     return [files[number] for number in sorted(set(shards) or files)]
 
 
@@ -201,9 +199,7 @@ def list_grasps(file: Path) -> list[Grasp]:
             indices = sorted(int(name[1:]) for name in data if re.fullmatch(r"i\d+", name))
             return [_describe(data, Grasp(file, _number(file), index)) for index in indices]
     except (OSError, KeyError, RuntimeError, TypeError) as error:  # h5py raises these for damaged files
-        raise ValueError(
-            f"{file} cannot be read ({brief(error)}): download it again, or leave it out of shards"
-        ) from None
+        raise ValueError(f"{file} cannot be read ({brief(error)}): download it, or leave it out of shards") from None
 
 
 def _describe(data: Any, grasp: Grasp) -> Grasp:

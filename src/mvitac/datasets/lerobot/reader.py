@@ -101,10 +101,8 @@ class LeRobotConfig(RecordedConfig):
                 if miss <= self.tolerance:
                     places[i] = Frame(str(file), frame)
                 elif not self.allow_missing:
-                    raise ValueError(
-                        f"{file}: no frame within {self.tolerance:g} s of {moment:.3f} s (episode {name}, the nearest is"
-                        f" {miss:.3f} s away): give a larger --data.tolerance, or --data.allow-missing"
-                    )
+                    far = f"{file}: no frame within {self.tolerance:g} s of {moment:.3f} s (episode {name}, the nearest is"
+                    raise ValueError(f"{far} {miss:.3f} s away): --data.tolerance, or --data.allow-missing")
         return places
 
 

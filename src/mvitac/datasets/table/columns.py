@@ -11,7 +11,6 @@ from mvitac.data.pack_table import SPLITS
 from mvitac.data.spec import UNGROUPED, Target, Task, ValueTask, listed
 from mvitac.datasets.table.manifest import Manifest, Row, normal, number_of, text_of
 
-MAX_ONE_HOT = 64
 COMPARE: dict[str, Callable[[float, float], bool]] = {"<=": operator.le, ">=": operator.ge}
 
 
@@ -129,29 +128,18 @@ def check_names(table: Manifest, names: Iterable[str], own: Collection[str]) -> 
             raise ValueError(f"{table.path}: column {name!r} has a name of the pack itself: copy it to another name")
 
 
-def read_controls(
-    table: Manifest, controls: dict[str, tuple[str, ...]], labels: Sequence[Sequence[int]]
-) -> tuple[dict[str, list[float]], dict[str, tuple[str, ...]]]:
-    """Return numeric pack columns for ``controls``, and the names of the columns that each control uses."""
+def read_controls(table: Manifest, columns: Iterable[str], labels: Sequence[Sequence[int]]) -> dict[str, list[float]]:
+    """Return the numbers of control ``columns``; a row without a label may lack them, as no probe reads it: 0."""
     labelled = [any(task[i] >= 0 for task in labels) for i in range(len(table.rows))]
-    made = {c: _numeric(table, c, labelled) for c in dict.fromkeys(c for given in controls.values() for c in given)}
-    columns = {name: values for each in made.values() for name, values in each.items()}
-    return columns, {name: tuple(c for column in given for c in made[column]) for name, given in controls.items()}
-
-
-def _numeric(table: Manifest, column: str, labelled: Sequence[bool]) -> dict[str, list[float]]:
-    """Return ``column`` as numbers, or one-hot columns if it holds text."""
-    cells = [row[column] for row in table.rows]
-    for i, cell in enumerate(cells):
-        if labelled[i] and not cell:
-            raise ValueError(f"{table.at(i)} is labelled, and control column {column!r} is empty")
-    values = [number_of(cell) for cell in cells]
-    if all(value is not None or not cell for value, cell in zip(values, cells, strict=True)):
-        return {column: [value or 0.0 for value in values]}  # an empty cell is unlabelled, so never probed: any number
-    names = sorted({cell for cell in cells if cell})
-    if len(names) > MAX_ONE_HOT:
-        raise ValueError(f"{table.path}: control column {column!r} has {len(names)} texts: at most {MAX_ONE_HOT}")
-    return {f"{column}={name}": [float(cell == name) for cell in cells] for name in names}
+    made: dict[str, list[float]] = {}
+    for column in columns:
+        values = [number_of(row[column]) for row in table.rows]
+        for i, value in enumerate(values):
+            if value is None and labelled[i]:
+                cell = table.rows[i][column]
+                raise ValueError(f"{table.at(i)} is labelled, and control column {column!r} is {cell!r}, not a number")
+        made[column] = [value or 0.0 for value in values]
+    return made
 
 
 def ungrouped(texts: Mapping[str, Sequence[str]], splits: Sequence[str], labels: Sequence[Sequence[int]]) -> str:

@@ -74,10 +74,8 @@ def check_present(
         gaps = [[table.images[c][i] is None for c in columns] for i in range(len(table.rows))]
         for i, gap in enumerate(gaps):
             if any(gap) and not (allow_missing and all(gap)):
-                hint = "--data.allow-missing accepts such rows" if all(gap) else "stacked sensors need both images"
-                raise ValueError(
-                    f"{table.at(i)} has no {columns[gap.index(True)]} path: {hint}, --data.only leaves it out"
-                )
+                hint = "--data.allow-missing accepts it" if all(gap) else "stacked sensors need both images"
+                raise ValueError(f"{table.at(i)} has no {columns[gap.index(True)]} path: {hint}")
         lacking = [bool(gap) and all(gap) for gap in gaps]
         if all(lacking) and columns:
             raise ValueError(f"{table.path}: {modality} is empty in every row: leave it out by --data.{modality} ''")

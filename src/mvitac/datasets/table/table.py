@@ -74,8 +74,7 @@ class RowsConfig(DatasetConfig, ABC):
     allow_missing: bool = False
     """Accept rows without a camera image or without a tactile image. Pairs and probes skip them where they need it."""
     controls: tuple[str, ...] = ()
-    """Controls as "name=column[,column]": a logistic regression on these columns instead of features. Columns of text
-    become one-hot."""
+    """Controls as "name=column[,column]": a logistic regression on these columns of numbers instead of features."""
     only: tuple[str, ...] = ()
     """Conditions on the rows to read, e.g. "seq<=4" "sensor=digit" "label_conflict!=1"; all must hold."""
     label_only: tuple[str, ...] = ()
@@ -216,7 +215,8 @@ class Rows(Source):
         values, measured = columns.read_values(table, value_tasks, counts)
         tasks, labels = [*(task for task, _ in read), *value_tasks], [*(label for _, label in read), *measured]
         assigned = self._assign(table, {f"groups ({group_by})": groups, "touch groups": touch_groups}, tasks, labels)
-        extra, controls = columns.read_controls(table, config.control_columns(), labels)
+        controls = config.control_columns()
+        extra = columns.read_controls(table, dict.fromkeys(c for used in controls.values() for c in used), labels)
 
         own: dict[str, Sequence[Any]] = {"id": table.ids(), "group": groups, "touch_group": touch_groups}
         own |= {"split": assigned, **{f"label_{task.name}": label for task, label in read}}
