@@ -33,6 +33,9 @@ def test_features_are_the_models(model: Model, pack: Pack) -> None:
     history = {k: v[None].expand(4, -1, -1, -1, -1) for k, v in seen.items()}
     torch.testing.assert_close(encoder(history), wanted[None].expand(4, -1, -1), atol=1e-4, rtol=1e-4)
     assert encoder.out_features == wanted.shape[1]
+    maps = encoder.maps(history)["touch"]  # this trunk's features are the mean over places
+    assert maps.ndim == 5 and not maps.requires_grad
+    torch.testing.assert_close(maps.mean((-2, -1))[0], expected["touch"], atol=1e-4, rtol=1e-4)
 
 
 def test_images_are_seen_at_the_side_the_model_predicts_at(model: Model, pack: Pack) -> None:
@@ -67,6 +70,7 @@ def test_tuned_encoders_get_gradients_but_keep_their_batchnorm(model: Model, pac
     before = {k: v.clone() for k, v in encoder.named_buffers()}
     encoder(observe(pack, [0, 1])).sum().backward()
     assert all(p.grad is not None for p in encoder.encoders.parameters())
+    assert encoder.maps(observe(pack, [0]))["vision"].requires_grad
     assert all(torch.equal(before[k], v) for k, v in encoder.named_buffers())
 
 

@@ -230,11 +230,13 @@ def _read_packets(path: str, size: int, changed: int) -> Packets:
     """Read the packet table. Mp4 and complete AVI files store one; in other files, all packets are visited."""
     with _opened(path) as (container, stream):
         shape = (stream.codec_context.height, stream.codec_context.width)
-        table = stream.index_entries
-        if "mp4" in container.format.name or ("avi" in container.format.name and len(table) == stream.frames):
+        avi, table = "avi" in container.format.name, getattr(stream, "index_entries", None)  # PyAV 15 has no table
+        if table is not None and ("mp4" in container.format.name or (avi and len(table) == stream.frames)):
             found = [(e.timestamp, e.pos, e.is_keyframe, e.is_discard) for e in table if e.size]
         else:
             found = [(p.dts, p.pos, p.is_keyframe, p.is_discard) for p in container.demux(stream) if p.size]
+        if table is None and avi and len(found) != stream.frames:
+            raise ValueError(f"{path} is damaged, and PyAV {av.__version__} cannot number its frames: use 18 or newer")
     before = np.cumsum([0, *(not cut for *_, cut in found)])
     if not before[-1] or any(dts is None or place is None for dts, place, *_ in found):
         raise ValueError(f"{path} holds no frames that can be told apart: it is damaged, or convert it to mp4")

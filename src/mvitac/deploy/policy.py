@@ -7,7 +7,8 @@
 Follows LeRobot's convention: images are [B, 3, H, W] (or [B, T, 3, H, W]), float in [0, 1] or uint8, RGB.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -57,9 +58,30 @@ class ObservationEncoder(nn.Module):
 
     def forward(self, observation: Mapping[str, Tensor]) -> Tensor:
         """Features of a batch of observations; KeyError or ValueError names a key that is missing or of another shape."""
-        found, lead = [], ()
+        features = torch.cat(list(self._each(observation, lambda trunk, images: trunk(images)).values()), dim=-1)
+        lead = features.shape[:-1]
+        if not self.state:
+            return features
+        state = observation[STATE]
+        if state.shape != (*lead, self.state):
+            raise ValueError(f"{STATE}: expected {(*lead, self.state)}, got {tuple(state.shape)}")
+        return torch.cat([features, state.float()], dim=-1)
+
+    def maps(self, observation: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The last feature map [B, D, h, w] of the trunk of each modality, for a policy that reads images by places.
+
+        Images are normalised in here, as for ``forward``, so the policy must not do it again.
+        """
+        return self._each(
+            observation,
+            lambda trunk, images: trunk.forward_intermediates(images, indices=1, intermediates_only=True)[0],
+        )
+
+    def _each(self, observation: Mapping[str, Tensor], network: Callable[[Any, Tensor], Tensor]) -> dict[str, Tensor]:
+        """What ``network`` makes of each modality's trunk and normalised images, [B, ...] or [B, T, ...]."""
+        found = {}
         for modality, names in self.keys.items():
-            views = []
+            views, lead = [], torch.Size()
             for name in names:
                 image = observation[name]
                 lead, flat = image.shape[:-3], image.flatten(0, -4)
@@ -68,11 +90,5 @@ class ObservationEncoder(nn.Module):
                     self._checked.add(name)
                 views.append(self._input(modality, resized(flat, self.stored)))
             with torch.set_grad_enabled(self.tune and torch.is_grad_enabled()):
-                found.append(self.encoders[modality](torch.cat(views, dim=1)).float())
-        features = torch.cat(found, dim=1).unflatten(0, lead)
-        if not self.state:
-            return features
-        state = observation[STATE]
-        if state.shape != (*lead, self.state):
-            raise ValueError(f"{STATE}: expected {(*lead, self.state)}, got {tuple(state.shape)}")
-        return torch.cat([features, state.float()], dim=-1)
+                found[modality] = network(self.encoders[modality], torch.cat(views, dim=1)).float().unflatten(0, lead)
+        return found
