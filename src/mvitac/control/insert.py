@@ -22,7 +22,7 @@ import numpy as np
 
 from mvitac.control.learn import Lesson
 from mvitac.control.servo import FIELD_MM, SIZE, Copy, Shape, draw_copy, draw_shape, textured, textures
-from mvitac.control.suite import SHUFFLED, TUNED, Cell, LoopSuite
+from mvitac.control.suite import SHUFFLED, Cell, LoopSuite
 from mvitac.evaluation.intervals import interval
 from mvitac.sim.coordinates import grid
 
@@ -257,8 +257,7 @@ class Insert(LoopSuite):
 
     def cells(self, source: str) -> list[Cell]:
         """The senses and numbers of demonstrations that a row has."""
-        both = ("both",)
-        only = {self.true: both, self.blind: both, TUNED: both, SHUFFLED: ("touch", *both)}.get(source, tuple(SENSES))
+        only = {self.true: ("both",), self.blind: ("both",), SHUFFLED: ("touch", "both")}.get(source, tuple(SENSES))
         return [(senses, f"{num}") for senses in only for num in self.demonstrations]
 
     def world(self, task: str, condition: str, number: int) -> Insertion:

@@ -58,7 +58,7 @@ def blind(images: dict[str, np.ndarray], targets: np.ndarray, num_val: int) -> E
     return lambda look: targets.mean(0)
 
 
-def trained(model: Model, steps: int, rate: float) -> Learn:
+def trained(model: Model, steps: int) -> Learn:
     """Train a copy of ``model`` for each sense and one linear head, by smooth L1 on standardised targets."""
 
     def tensors(images: Sequence[np.ndarray]) -> list[Tensor]:
@@ -77,7 +77,7 @@ def trained(model: Model, steps: int, rate: float) -> Learn:
             head = nn.Linear(sum(num_features(model.encoders[m]) for m in images), targets.shape[1])
             learned = [p.requires_grad_() for p in (*trunks.parameters(), *head.parameters()) if p.is_floating_point()]
             optimiser = torch.optim.AdamW(learned, weight_decay=0.05)
-            schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=steps)
+            schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=steps)
             for _ in range(steps):
                 rows = torch.randint(len(y), (64,))
                 loss = nn.functional.smooth_l1_loss(head(features([each[rows] for each in x])), y[rows])

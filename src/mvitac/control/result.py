@@ -20,7 +20,7 @@ from mvitac.bench.score import kept_part
 from mvitac.control.ablate import suite_episodes
 from mvitac.control.insert import Insert
 from mvitac.control.servo_rows import Servo
-from mvitac.control.suite import OWN, SHUFFLED, TUNED, Row, rows_of, score
+from mvitac.control.suite import OWN, SHUFFLED, Row, rows_of, score
 from mvitac.control.video import encoded, film
 from mvitac.evaluation.intervals import paired_difference
 from mvitac.model import Model
@@ -62,7 +62,7 @@ def run_suite(places: Sequence[str], suite: Suite, out: Path, about: About) -> P
             raise ValueError(problem)
         with work(f"{encoder['name']} on {suite.name}", len(asked), "rows") as advance:
             for row in asked:
-                key = digest(encoder) if row.source in (OWN, TUNED, SHUFFLED) else "controls"
+                key = digest(encoder) if row.source in (OWN, SHUFFLED) else "controls"
                 known = [suite.digest(), row.source, row.seed, here["versions"], here["commit"]]
                 cells = kept_part(out / "parts", key, known, lambda one=row: score(suite, one))
                 rows.append({"source": row.source, "seed": row.seed, "cells": cells})
@@ -95,8 +95,7 @@ def _problems(value: dict[str, Any], suite: Suite) -> Iterator[str]:
     seeds = value["encoder"]["seeds"]
     want = [*((OWN, seed) for seed in seeds), ("pixels", None)]
     want += [("untrained", seed) for seed in range(len(suite.untrained))]
-    rest = [(TUNED, seeds[0])] if suite.cells(TUNED) else []
-    rest += [(SHUFFLED, seeds[0]), (suite.true, None), (suite.blind, None), ("end to end", None)]
+    rest = [(SHUFFLED, seeds[0]), (suite.true, None), (suite.blind, None), ("end to end", None)]
     have = [(row["source"], row["seed"]) for row in value["rows"]]
     if have not in ([*want, *rest], [*want, ("imagenet", None), *rest]):
         yield f"has the rows {have}, the suite asks for {want + rest}"
@@ -120,11 +119,9 @@ def scores(values: Sequence[dict[str, Any]]) -> Scored:
     found: Scored = {}
     for value in values:
         mine: Scored = {}
-        own = value["encoder"]["name"]
         for row in value["rows"]:
-            name = {OWN: own, TUNED: f"{own}, tuned"}.get(row["source"], row["source"])
             for cell in row["cells"]:
-                of = mine.setdefault(name, {})
+                of = mine.setdefault(row["source"] or value["encoder"]["name"], {})
                 of.setdefault((cell["task"], cell["condition"]), []).append({**cell, "seed": row["seed"]})
         found |= mine
     return found

@@ -13,7 +13,7 @@ import numpy as np
 
 from mvitac.control.learn import Lesson
 from mvitac.control.servo import STEP_MM, STEP_MS, TASKS, begun, picture, presses, task_of
-from mvitac.control.suite import TUNED, Cell, LoopSuite
+from mvitac.control.suite import Cell, LoopSuite
 from mvitac.evaluation.intervals import mean_interval
 
 
@@ -69,8 +69,7 @@ class Servo(LoopSuite):
 
     def cells(self, source: str) -> list[Cell]:
         """The tasks and conditions that a row has."""
-        every = [(kind, condition.name) for kind in self.kinds for condition in self.conditions]
-        return [] if source == TUNED else every
+        return [(kind, condition.name) for kind in self.kinds for condition in self.conditions]
 
     def world(self, task: str, condition: str, number: int) -> "Episode":
         return Episode(self, task, next(one for one in self.conditions if one.name == condition), number)

@@ -26,7 +26,7 @@ from mvitac.registry import to_json
 from mvitac.system.files import digest
 
 Cell = tuple[str, str]  # task and condition
-OWN, SHUFFLED, TUNED = "", "touch shuffled", "tuned"  # rows of the encoder that is scored
+OWN, SHUFFLED = "", "touch shuffled"  # rows of the encoder that is scored
 
 
 @dataclass(frozen=True)
@@ -77,16 +77,14 @@ class LoopSuite:
 
 def rows_of(suite: Any, models: Sequence[Model]) -> list[Row]:
     """The encoder's seeds first, then the controls; ImageNet only where its weights can be had."""
-    first = models[0]
     own = [Row(OWN, model.seed, ridge(encoding(model))) for model in models]
     beside = [
         Row(name, None if name == "imagenet" else model.seed, ridge(encoding(model))) for name, model in trunks(suite)
     ]
-    tuned = [Row(TUNED, first.seed, trained(first, suite.train_steps, 3e-4))] if suite.cells(TUNED) else []
     known = Row(suite.true, None, None), Row(suite.blind, None, blind)
-    scratch = Row("end to end", None, trained(open_model(suite.untrained[0]), suite.train_steps, 2e-3))
-    shuffled = Row(SHUFFLED, first.seed, own[0].learn)
-    return [*own, Row("pixels", None, ridge(pixels)), *beside, *tuned, shuffled, *known, scratch]
+    scratch = Row("end to end", None, trained(open_model(suite.untrained[0]), suite.train_steps))
+    shuffled = Row(SHUFFLED, own[0].seed, own[0].learn)
+    return [*own, Row("pixels", None, ridge(pixels)), *beside, shuffled, *known, scratch]
 
 
 def score(suite: Any, row: Row) -> list[dict[str, Any]]:
