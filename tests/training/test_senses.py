@@ -10,13 +10,14 @@ from safetensors.torch import save_file
 import mvitac
 from mvitac.data.pack import Pack
 from mvitac.deploy.export_module import ExportModule
+from mvitac.evaluation import features
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, build_trunk
 from mvitac.nn.momentum import Momentum
 from mvitac.run import Optim, Run
-from mvitac.training import setup, views
+from mvitac.training import setup
 from mvitac.training.loop import train
 from mvitac.training.step import build_optimiser
 from mvitac.transforms.random_views import Augment, ViewAugment
@@ -112,14 +113,16 @@ def test_masked_methods_read_tokens_of_another_width_and_grid(pack: Pack, tmp_pa
 def test_a_locked_trunk_sees_each_whole_image_once(
     pack: Pack, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    """The run is the one whose trunk sees it at every step, to rounding, and resumes bit for bit."""
+    """The run is the one whose trunk sees it at every step, to rounding, and resumes bit for bit. Probes read the same."""
     whole = ViewAugment(scale=(1.0, 1.0), flip=0.0, grayscale=0.0, size=24)
     run = replace(started(pack, file, locked=True), method=small(name), augment=replace(SIZES, vision=whole))
-    seen: list[int] = []
-    real = views.plain_view
-    monkeypatch.setattr(views, "plain_view", lambda images, *rest: seen.append(len(images)) or real(images, *rest))
-    train(run, tmp_path / "straight", quiet=True, validate=False)
-    assert sum(seen) <= pack.num
+    monkeypatch.setenv("MVITAC_CACHE", str(tmp_path))
+    seen: list[str] = []
+    real = features.pack_features
+    monkeypatch.setattr(features, "pack_features", lambda *given, **how: seen.append(given[2]) or real(*given, **how))
+    train(run, tmp_path / "straight", quiet=True)
+    mvitac.probe(tmp_path / "straight", tasks=("bright",), controls=False)
+    assert seen.count("vision") == 1
     with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
         train(run, tmp_path / "cut", quiet=True, validate=False)
     train(run, tmp_path / "cut", resume=True, quiet=True, validate=False)

@@ -58,7 +58,7 @@ class Engine:
 
         Args:
             folder: What ``mvitac export`` wrote.
-            engine: onnxruntime, openvino, or auto: OpenVINO where it is installed.
+            engine: onnxruntime, openvino, or auto: OpenVINO where it is installed (for int8 only on a CPU with VNNI).
             threads: CPU threads, 0 = all cores.
 
         Raises:
@@ -155,7 +155,8 @@ def spread_at(target: Mapping[str, Any], value: float) -> float:
 def open_model(path: Path, engine: Runtime = "auto", precision: str = "fp32", threads: int = 0) -> Call:
     """An ONNX file as a function from input arrays to output arrays. Only OpenVINO computes in bf16."""
     if engine == "auto":
-        engine = "openvino" if importlib.util.find_spec("openvino") else "onnxruntime"
+        wanted = importlib.util.find_spec("openvino") and (precision != "int8" or _has_vnni())
+        engine = "openvino" if wanted else "onnxruntime"
     threads = threads or os.cpu_count() or 1
     try:
         return _openvino(path, precision, threads) if engine == "openvino" else _onnxruntime(path, threads)
@@ -163,6 +164,15 @@ def open_model(path: Path, engine: Runtime = "auto", precision: str = "fp32", th
         raise ValueError(f"{path} needs {error.name}: pip install -e '.[export]' in mvitac's clone") from None
     except Exception as error:  # each engine has its own exceptions
         raise ValueError(f"{path} cannot be opened ({brief(error)}): export it again") from None
+
+
+def _has_vnni() -> bool:
+    """Whether the CPU has instructions for 8-bit products.
+
+    Without them OpenVINO 2026.4 computed another result in 2 of 1,500 calls, with two threads (docs/export.md).
+    """
+    flags = Path("/proc/cpuinfo")
+    return "AVX2" not in os.environ.get("ONEDNN_MAX_CPU_ISA", "") and flags.exists() and "vnni" in flags.read_text()
 
 
 def _onnxruntime(path: Path, threads: int) -> Call:

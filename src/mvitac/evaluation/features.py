@@ -54,6 +54,9 @@ def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_h
             if not known.all():
                 values[~known] = features(model, pack, modality, rows[~known], for_heads=for_heads)
             return values
+    every = np.arange(pack.num)
+    if len(rows) < pack.num and _place(model, pack, modality, every, for_heads=for_heads).exists():
+        return features(model, pack, modality, every, for_heads=for_heads)[rows]
     path = _place(model, pack, modality, rows, for_heads=for_heads)
     if path.exists():
         data = path.read_bytes()

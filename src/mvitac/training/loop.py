@@ -99,7 +99,7 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
     with made or nullcontext() as log, _stop_signals() as stop_requested:
         if log and not quiet:
             log.say(setup.hardware.sentence)
-        validation = Validation(out, run, method, pack, setup.spec, log, setup.kept) if log and validate else None
+        validation = Validation(out, setup, log) if log and validate else None
         if validation and start == 0:
             validation(0)
         method.train()

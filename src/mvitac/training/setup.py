@@ -2,17 +2,20 @@
 
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
 from mvitac.data.windows import places
 from mvitac.datasets.base import DatasetConfig
+from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import FILE, file_source, source_of, weights_files, with_ancestors, write_sources
 from mvitac.evaluation.sensors import sensors_of
 from mvitac.methods.base import Method
@@ -26,6 +29,7 @@ from mvitac.system.device import Hardware, describe, has_bf16, pick_device
 from mvitac.system.distributed import World, local_device
 from mvitac.system.files import brief, check_place, is_temporary, write_json
 from mvitac.system.malloc import keep_freed_memory
+from mvitac.system.progress import shown
 from mvitac.system.provenance import provenance
 from mvitac.training import checkpoint
 from mvitac.training.sampler import check_mix
@@ -33,6 +37,8 @@ from mvitac.training.start import Start, load_start, read_start, warning
 from mvitac.training.start import describe as describe_start
 from mvitac.training.step import Step
 from mvitac.training.views import StepViews, values_of
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -68,8 +74,9 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     method, taken = _build_method(run, pack, rows, device, start)
     step = Step(run, method, device, world)
     done, kept = checkpoint.restore(out, run, method, step.optimiser, world)
-    locked = {m: t for m, t in method.encoders().items() if is_locked(t) and run.augment.of(m).fixed}
-    views = StepViews(run, pack, method.views, device, world, {} if run.method.needs_vit else locked)
+    with nullcontext() if quiet or not world.writes else shown():
+        locked = _locked_features(run, pack, method, world)
+    views = StepViews(run, pack, method.views, device, world, locked)
     before = start.sensors if start and "touch" in taken["taken"] else ()
     spec = replace(pack.spec, sensors=tuple(sorted({*sensors_of(pack, rows), *before})))
     setup = Setup(run, pack, rows, hardware, world, method, views, step, done, kept, spec)
@@ -194,13 +201,18 @@ def _work(run: Run, pack: Pack, device: torch.device) -> Callable[[], None]:
 
 
 def open_pack(data: DatasetConfig, world: World, quiet: bool) -> Pack:
-    """Open ``data``. Rank 0 simulates or packs what does not exist yet, then the others open it."""
+    """Open ``data``; rank 0 simulates or packs what does not exist yet."""
+    return _first_here(lambda: data.open(quiet=quiet or not world.writes), world)
+
+
+def _first_here(read: Callable[[], T], world: World) -> T:
+    """What ``read`` returns. Rank 0 computes what is not in the cache yet, then the others read it."""
     if world.rank:
         world.wait()
-    pack = data.open(quiet=quiet or not world.writes)
+    found = read()
     if not world.rank:
         world.wait()
-    return pack
+    return found
 
 
 def _build_method(
@@ -217,6 +229,18 @@ def _build_method(
     method.to(device).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     _check_image_size(method, run, pack)
     return method, taken
+
+
+def _locked_features(run: Run, pack: Pack, method: Method, world: World) -> dict[str, Tensor]:
+    """Modality -> features [pack.num, D] of locked trunks, of whole images, from the cache that probes read, too."""
+    model, found = Model(method, run, pack.spec, pack.size), {}
+    for m, trunk in method.encoders().items():
+        if is_locked(trunk) and run.augment.of(m).fixed and not run.method.needs_vit:
+            rows = np.flatnonzero(pack.has(m))
+            known = torch.from_numpy(_first_here(lambda m=m, rows=rows: features(model, pack, m, rows), world))
+            found[m] = torch.zeros(pack.num, known.shape[1]).index_put((torch.from_numpy(rows),), known)
+            found[m] = found[m].to(next(trunk.parameters()).device)
+    return found
 
 
 def _check_image_size(method: Method, run: Run, pack: Pack) -> None:

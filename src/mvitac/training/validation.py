@@ -5,8 +5,9 @@ those with the lowest errors of the linear probe (``diagnostics.mean_error``).
 """
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -15,14 +16,14 @@ from torch import Tensor
 
 from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
-from mvitac.data.spec import AnyTask, DataSpec, Task
+from mvitac.data.spec import AnyTask, Task
 from mvitac.evaluation import diagnostics
 from mvitac.evaluation.features import pack_features
-from mvitac.methods.base import Method
 from mvitac.model import Model
 from mvitac.model_files import BEST
 from mvitac.run import Run
 from mvitac.training.log import Log
+from mvitac.training.setup import Setup
 
 NUM_EVAL_TRAIN, NUM_EVAL_VAL = 1024, 512
 MIN_GROUPS = 10  # with fewer groups in val, an interval over them says nothing
@@ -34,20 +35,17 @@ ratio: accuracy of a class (errors: wrong rows; guess: all rows), R2 of a value 
 class Validation:
     """Evaluates a method while it trains, compares it with its start, and keeps the best weights.
 
-    ``spec`` describes the models that are kept (``Setup.spec``). ``kept`` is the state of the last checkpoint, which a
-    resumed run continues with; empty at the start.
+    ``setup.kept`` is the state of the last checkpoint, which a resumed run continues with; empty at the start.
     """
 
-    def __init__(
-        self, out: Path, run: Run, method: Method, pack: Pack, spec: DataSpec, log: Log, kept: dict[str, Any]
-    ) -> None:
-        self.out, self.run, self.method, self.pack, self.spec = out, run, method, pack, spec
-        self.log, self.kept = log, kept
+    def __init__(self, out: Path, setup: Setup, log: Log) -> None:
+        self.out, self.run, self.method, self.pack, self.spec = out, setup.run, setup.method, setup.pack, setup.spec
+        self.log, self.kept, self.locked = log, setup.kept, setup.views.locked
 
     def __call__(self, step: int, *, last: bool = False) -> None:
         """Evaluate after ``step`` steps; write model.best.safetensors if it is the best so far."""
         model = Model(self.method, self.run, self.spec, self.pack.size)
-        values, cells = validate(model, self.pack, self.run)
+        values, cells = validate(model, self.pack, self.run, self.locked)
         self.method.train()
         if step == 0:
             self.kept["start"] = cells
@@ -67,41 +65,49 @@ class Validation:
         return text
 
 
-def validate(model: Model, pack: Pack, run: Run) -> tuple[dict[str, float], Cells]:
+def validate(
+    model: Model, pack: Pack, run: Run, locked: Mapping[str, Tensor] = MappingProxyType({})
+) -> tuple[dict[str, float], Cells]:
     """Scores on held-out groups (split val, never test), and the linear probes' errors by group, to compare evaluations.
 
     Only rows with both modalities are used. Without rows of val that are not trained on, the scores are computed on
     training rows, and there are no probes. Scores are by name, e.g. "touch/linear category", "touch/knn category",
     "vision/rankme", "vision->touch R@5"; of a mix, those of each part, named "<part> <name>".
+
+    ``locked``: modality -> features [pack.num, D] that are known already.
     """
     if not isinstance(pack, MixedPack):
-        return _validate(model, pack, run)
+        return _validate(model, pack, run, locked)
     values: dict[str, float] = {}
     cells: Cells = {}
     for part in pack.parts:
-        own, found = _validate(model, pack.alone(part), run)
+        own, found = _validate(model, pack.alone(part), run, {})
         values |= {f"{part} {name}": value for name, value in own.items()}
         cells |= {f"{part} {name}": cell for name, cell in found.items()}
     return values, cells
 
 
 @torch.no_grad()
-def _validate(model: Model, pack: Pack, run: Run) -> tuple[dict[str, float], Cells]:
+def _validate(model: Model, pack: Pack, run: Run, locked: Mapping[str, Tensor]) -> tuple[dict[str, float], Cells]:
     """Scores and errors on ``pack`` alone."""
+
+    def read(m: str, rows: np.ndarray) -> Tensor:
+        return locked[m][rows].cpu() if m in locked else pack_features(model, pack, m, rows, bf16=run.bf16)
+
     rng = np.random.default_rng(0)  # the same rows at every step and for every seed
     modalities = pack.spec.modalities
     train_rows = _sample(pack.rows("train", "unlabelled", having=modalities), NUM_EVAL_TRAIN, rng)
     val_rows = np.setdiff1d(pack.rows("val", having=modalities), run.method.training_rows(pack))
     held_out = len(val_rows) > 1
     rows = _sample(val_rows, NUM_EVAL_VAL, rng) if held_out else train_rows[:NUM_EVAL_VAL]
-    z = {m: pack_features(model, pack, m, rows, bf16=run.bf16) for m in model.encoders if m in modalities}
+    z = {m: read(m, rows) for m in model.encoders if m in modalities}
     values: dict[str, float] = {}
     cells: Cells = {}
     for modality, features in z.items():
         values[f"{modality}/std"] = diagnostics.spread(features)
         values[f"{modality}/rankme"] = diagnostics.rank_me(features)
     if held_out:
-        bank = {m: pack_features(model, pack, m, train_rows, bf16=run.bf16) for m in z}
+        bank = {m: read(m, train_rows) for m in z}
         values |= _knn(pack, train_rows, rows, bank, z)
         cells = _linear(pack, train_rows, rows, _with_both(bank), _with_both(z))
         values |= {name: float(_scores(cell).mean()) for name, cell in cells.items()}
@@ -237,8 +243,9 @@ def _change(start: Tensor, end: Tensor) -> tuple[float, float]:
 def _shared_space(model: Model, pack: Pack, run: Run, rows: np.ndarray, z: dict[str, Tensor]) -> dict[str, float]:
     """Alignment, uniformity and retrieval in the space shared by both modalities, on ``rows``, whose features are ``z``."""
     device = next(model.parameters()).device
-    if any(whole != heads for whole, heads in map(model.sides, z)):
-        z = {m: pack_features(model, pack, m, rows, for_heads=True, bf16=run.bf16) for m in z}
+    for m, (whole, heads) in {m: model.sides(m) for m in z}.items():
+        if whole != heads:
+            z = z | {m: pack_features(model, pack, m, rows, for_heads=True, bf16=run.bf16)}
     shared = {m: model.project(m, z[m].to(device)).cpu() for m in z}
     groups = torch.from_numpy(np.unique(pack.column("group")[rows], return_inverse=True)[1])
     values = {"alignment": diagnostics.alignment(shared["vision"], shared["touch"])}

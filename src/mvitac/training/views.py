@@ -5,28 +5,25 @@ from functools import partial
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Pack
 from mvitac.methods.base import Views
-from mvitac.nn.encoders import num_features
 from mvitac.run import Run
 from mvitac.system.distributed import World
 from mvitac.training.loader import Feed, ahead, prefetch
 from mvitac.training.sampler import Batches, mix, partners
 from mvitac.training.step import Chunk
-from mvitac.transforms.random_views import draw, plain_view, random_view
-
-BLOCK = 64  # rows whose features a locked trunk computes at once
+from mvitac.transforms.random_views import draw, random_view
 
 
 class StepViews:
     """Random views of the rows of a step, as the chunks that this process embeds.
 
     They depend on (seed, step, number of the chunk) only. Two processes thus see the same views as one process with chunks
-    of half the batch. ``num`` is the number of views of an image (``Method.views``). ``locked``: modality -> trunk whose
-    features it gives, because its views do not vary.
+    of half the batch. ``num`` is the number of views of an image (``Method.views``). ``locked``: modality -> the
+    features [pack.num, D] of a locked trunk, which it gives instead of images, because they do not vary.
     """
 
     def __init__(
@@ -36,11 +33,11 @@ class StepViews:
         num: int,
         device: torch.device,
         world: World | None = None,
-        locked: Mapping[str, nn.Module] | None = None,
+        locked: Mapping[str, Tensor] | None = None,
     ) -> None:
         self.run, self.pack, self.num, self.device, self.world = run, pack, num, device, world or World()
         self.feed = Feed(pack, device)
-        self.locked = {m: LockedFeatures(run, self.feed, m, trunk) for m, trunk in (locked or {}).items()}
+        self.locked = locked or {}
         share = run.batch_size // self.world.size
         self.per_process = share // (run.chunk or share)
 
@@ -81,7 +78,7 @@ class StepViews:
             if m in self.locked:
                 for source in sources[m]:  # the other modality's views stay the same
                     draw(run.augment.of(m), len(own[id(source)]), pack.size, generator)
-            load = self.locked.get(m, partial(self.feed, m))
+            load = self.locked[m].__getitem__ if m in self.locked else partial(self.feed, m)
             fed = {name: load(source) for name, source in own.items()}
             how = run.augment.of(m), run.augment.size_of(m), generator, dtype, run.encoder[m].levels
             images[m] = [
@@ -104,30 +101,6 @@ class StepViews:
         if run.method.sensor_view:
             sources["touch"] = [*sources["touch"], partners(pack, rows, generator, other_sensor=True)]
         return sources
-
-
-class LockedFeatures:
-    """Features of a locked trunk for whole images of the rows of a pack, each computed once.
-
-    They are computed in blocks of rows, so that their last digits do not depend on which row is asked for first.
-    """
-
-    def __init__(self, run: Run, feed: Feed, modality: str, trunk: nn.Module) -> None:
-        self.run, self.feed, self.modality, self.trunk = run, feed, modality, trunk
-        self.known = np.zeros(feed.pack.num, bool)
-        self.table = torch.zeros(feed.pack.num, num_features(trunk), device=feed.device)
-
-    @torch.no_grad()
-    def __call__(self, rows: np.ndarray) -> Tensor:
-        """Features [B, D] of ``rows``, on the device."""
-        run, m = self.run, self.modality
-        for block in np.unique(rows[~self.known[rows]] // BLOCK):
-            new = block * BLOCK + np.flatnonzero(self.feed.pack.has(m)[block * BLOCK : (block + 1) * BLOCK])
-            view = plain_view(self.feed(m, new), run.augment.size_of(m), run.encoder[m].levels)
-            with torch.autocast(view.device.type, torch.bfloat16, enabled=run.bf16):
-                self.table[torch.from_numpy(new).to(view.device)] = self.trunk(view).float()
-            self.known[new] = True
-        return self.table[torch.from_numpy(rows).to(self.table.device)]
 
 
 def _senses(pack: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
