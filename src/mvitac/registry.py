@@ -19,6 +19,8 @@ from typing import Any, ClassVar, TypeVar
 
 T = TypeVar("T")
 
+PLACES = ("dataset", "plan", "suite")  # what may be named by a path, too
+
 
 class Registered:
     """Base class of every kind. ``choices`` maps each registered name of the kind to its class."""
@@ -39,6 +41,8 @@ class Registered:
 
 def unknown(what: str, given: str, allowed: typing.Iterable[str]) -> ValueError:
     """Return a ValueError that names the given value, the allowed ones and the closest match."""
+    if what in PLACES and not Path(given).exists() and ("/" in given or Path(given).suffix):
+        return ValueError(f"{given} does not exist: give a file that does, or the name of a {what}")
     allowed = list(allowed)
     near = difflib.get_close_matches(given, allowed, n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""

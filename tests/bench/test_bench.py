@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import timm
 import torch
 
 from mvitac.bench import score, suite
@@ -201,6 +202,8 @@ def test_imagenet_is_a_control_where_its_weights_are(
     assert "imagenet" in gather({value["encoder"]["name"]: value}).controls
     drop(value, source="imagenet", modality="both")
     assert problems(value)[0] == "stripes, pattern: lacks imagenet, both, 30 % of labels, None"
+    drop({"blocks": value["blocks"][:1]}, source="imagenet")
+    assert problems(value) == ["has the control imagenet in some tasks only"]
 
 
 def test_folds_test_every_group_once(root: Path, results: list[Path]) -> None:
@@ -265,24 +268,40 @@ def drop(value: dict[str, Any], **about: Any) -> None:
         block["records"] = [r for r in block["records"] if any(r.get(name) != wanted for name, wanted in about.items())]
 
 
+def not_run(block: dict[str, Any]) -> None:
+    for key in block.keys() - {"set", "task"}:
+        del block[key]
+    block["not_run"] = "no time"
+
+
 RECORDS, VALUES = ("blocks", 0, "records"), ("blocks", 1, "records", 0)
 MORE_CORRECT = put(*RECORDS, 0, "sums", "correct", 0, value=1000)
 FEW = "30 % of labels"
 FORGED: dict[str, tuple[Change, str]] = {
     "correct": (MORE_CORRECT, "more correct rows than rows"),
     "negative squares": (put(*VALUES, "sums", "squared_error", 0, 0, value=-1.0), "squared errors are smaller"),
+    "large squares": (put(*VALUES, "sums", "squared_error", 0, 0, value=1e9), "squared errors are smaller or larger"),
+    "unit": (put(*VALUES, "targets", 0, 1, value="kN"), "is scored on other rows"),
     "small squares": (
         put(*VALUES, "sums", "squared_error", 0, value=lambda errors: [x / 1e6 for x in errors]),
         "squared errors are smaller",
     ),
     "infinity": (put(*VALUES, "sums", "error", 0, 0, value=1e999), "is not finite"),
-    "text": (put(*RECORDS, 0, "sums", "correct", value="x"), "its sums are no numbers"),
+    "text": (put(*RECORDS, 0, "sums", "correct", 0, value="x"), "its sums are no numbers"),
+    "no sums": (put(*RECORDS, 0, "sums", value={}), "its sums are"),
     "rows": (
         put(*RECORDS, 0, "sums", "n", value=lambda sizes: [2 * n for n in sizes]),
         "is scored on other rows|more correct",
     ),
-    "score": (put(*RECORDS, 0, "auroc", value=1.0), "its fields are .*'auroc'"),
+    "score": (put(*RECORDS, 0, "auroc", value=1.0), "unknown field in result.blocks.records 'auroc'"),
+    "rank": (put("encoder", "rank", value=1), "unknown field in result.encoder 'rank'"),
     "seeds": (put("encoder", "seeds", value=[0, 1, 2]), "has 1 weights for seeds"),
+    "weights twice": (
+        put("encoder", value=lambda e: e | {"seeds": [0, 1], "weights": 2 * e["weights"]}),
+        "has 1 weights",
+    ),
+    "group twice": (put("blocks", 0, "groups", value=lambda names: [*names[:-1], names[0]]), "a group is there twice"),
+    "nothing": (lambda value: [not_run(block) for block in value["blocks"]], "was run on no task"),
     "twice": (put(*RECORDS, value=lambda records: [*records, records[0]]), "is there twice"),
     "modality": (lambda value: drop(value, source="", modality="both"), f"lacks the encoder, both, {FEW}, 0"),
     "probe": (lambda value: drop(value, source="", probe=FEW), f"lacks the encoder, both, {FEW}, 0"),
@@ -294,8 +313,18 @@ FORGED: dict[str, tuple[Change, str]] = {
     ),
     "task": (lambda value: value["blocks"].pop(3), "the suite asks for"),
     "name": (put("encoder", "name", value="untrained"), "the name of a control, 'untrained'"),
+    "same name": (put("encoder", "name", value=" Untrained"), "the name of a control, ' Untrained'"),
+    "no name": (put("encoder", "name", value=" "), "has the name ' '"),
     "images": (put("encoder", "images_seen", value=-5), "images_seen is -5"),
+    "parameters": (
+        put("encoder", "parameters", "touch", value=float("nan")),
+        "parameters.touch: expected int, got nan",
+    ),
     "form": (put("blocks", 0, "form", value="mine"), "the suite has no form 'mine'"),
+    "a number of sums": (put(*RECORDS, 0, "sums", value=3), "a.json is damaged"),
+    "encoder without seeds": (lambda value: value["encoder"].pop("seeds"), "a.json is damaged"),
+    "list of modalities": (put(*RECORDS, 0, "modality", value=["touch"]), "a.json is damaged"),
+    "block without data": (lambda value: value["blocks"][0].pop("data"), "a.json is damaged"),
 }
 
 
@@ -310,22 +339,23 @@ def test_a_forged_result_is_refused(
         assert re.search(words, said(capsys, "bench", command, forged)), command
 
 
-DAMAGED: list[tuple[str, Change]] = [
-    ("check", put(*RECORDS, 0, "sums", value=3)),
-    ("check", lambda value: value["encoder"].pop("seeds")),
-    ("board", put(*RECORDS, 0, "modality", value=["touch"])),
-    ("board", lambda value: value["blocks"][0].pop("data")),
-]
+def more_spread(value: dict[str, Any]) -> None:
+    """A larger R2 for all."""
+    for record in value["blocks"][1]["records"]:
+        record["sums"]["squared_value"] = [[10 * x for x in each] for each in record["sums"]["squared_value"]]
 
 
-@pytest.mark.parametrize(("command", "change"), DAMAGED)
-def test_a_damaged_result_is_one_line(
-    results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, change: Any
+def test_what_a_result_says_of_rows_and_of_leaks_is_compared(
+    results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = changed(results[0], tmp_path / "result.json", change, signed=True)
-    out = ["--out", tmp_path / "x.html"] if command == "board" else []
-    error = said(capsys, "bench", command, file, *out)
-    assert f"{file} is damaged: a field is missing or of another kind" in error and not (tmp_path / "x.html").exists()
+    forged = changed(results[1], tmp_path / "a.json", more_spread, signed=True)
+    assert main(["bench", "check", str(forged)]) == 0
+    assert "the majority or mean differs between" in said(capsys, "bench", "board", results[0], forged)
+    seen = put("encoder", "trained_on", value="ImageNet; toy stripes")
+    forged = changed(results[1], tmp_path / "a.json", seen, signed=True)
+    assert "its marks of leaks are not those of data trained on, ImageNet; toy" in said(
+        capsys, "bench", "check", forged
+    )
 
 
 def test_names_in_results_are_text(results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -437,6 +467,10 @@ def test_another_encoder_does_not_replace_a_result(results: list[Path], smoke_ru
         run_bench([RANDOM.format(6)], toys, results[0].parent, root, About(name=name))
     with pytest.raises(ValueError, match="not seeds of one encoder"):
         run_bench([RANDOM.format(6), RANDOM.format(6)], toys, results[0].parent, root, About())
+    torch.save(timm.create_model("test_resnet").state_dict(), root / "w.pth")
+    same = [f"external:{root}/w.pth,trunk=test_resnet,size=32,seed={seed}" for seed in (0, 1)]
+    with pytest.raises(ValueError, match="not seeds of one encoder"):
+        run_bench(same, toys, results[0].parent, root, About())
 
 
 def test_stacked_sensors_are_read_one_by_one(tmp_path: Path, smoke_run: Path, root: Path) -> None:

@@ -81,8 +81,9 @@ def test_a_path_is_data(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     for path, name in found.items():
         assert dataset(path) == replace(default(DatasetConfig, name), path=Path(path))
     assert dataset("materials") == default(DatasetConfig, "materials")
-    with pytest.raises(ValueError, match=r"unknown dataset 'pairs\.cvs'"):
-        dataset("pairs.cvs")
+    for name in ("pairs.cvs", "packs/mine"):
+        with pytest.raises(ValueError, match=f"^{name} does not exist"):
+            dataset(name)
 
 
 def test_help_names_every_command_in_80_columns() -> None:

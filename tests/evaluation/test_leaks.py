@@ -261,6 +261,9 @@ SAID = [
     ("ImageNet-1k", ""),
     ("ImageNet-1k; Toy", "toy was in its owner's training, which rows is not known"),
     ("", UNKNOWN),
+    (" ", UNKNOWN),
+    ("Unknown", UNKNOWN),
+    ("ImageNet-1k; unknown", UNKNOWN),
 ]
 
 

@@ -20,6 +20,7 @@ from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.intervals import interval, paired_difference
+from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.regressors import fit_curve, fit_ridge
 from mvitac.evaluation.scores import pool
 from mvitac.evaluation.value_scores import r2_without_each_group, score_values
@@ -58,6 +59,17 @@ def test_r2_without_a_group_is_that_of_the_other_rows() -> None:
     y, guess, groups = drawn()
     found = r2_without_each_group(score_values(y, guess, groups, POSE))
     assert found == pytest.approx([r2_score(y[groups != g], guess[groups != g]) for g in range(12)])
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_r2_is_the_same_in_any_unit(unit: float) -> None:
+    """A current in A or in nA."""
+    y, guess, groups = drawn()
+    small, usual = (score_values(unit * y, unit * guess, groups, POSE) for unit in (unit, 1))
+    assert small["r2"] == pytest.approx(usual["r2"])
+    assert r2_without_each_group(small) == pytest.approx(r2_without_each_group(usual))
+    x = np.random.default_rng(1).normal(size=(300, 60))
+    assert fit_ridge(x, unit * y, 60)[1] == fit_ridge(x, y, 60)[1]
 
 
 def test_the_interval_of_r2_holds_it_and_a_worse_method_is_told_apart() -> None:
@@ -151,6 +163,16 @@ def test_a_control_may_be_a_curve() -> None:
     y = x**2
     assert r2_score(y, fit_curve(x, y, 50)(x)) > 0.99
     assert r2_score(y, fit_ridge(x, y, 50)[0](x)) < 0.1
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(1e300, 0), (1e-300, 0), (1, 1e12)])
+def test_values_that_rounding_would_score_are_refused(scale: float, offset: float, measured: Pack) -> None:
+    """Squares of the first are infinite, of the second 0; of the third, such as stamps in ms, the digits are gone."""
+    light = measured.spec.values[0]
+    pack = Pack(measured.path)
+    pack._answers[(repr(light),)] = measured.values(light) * scale + offset
+    with pytest.raises(ValueError, match=r"level is from .* rounding would decide R2"):
+        split_rows(pack, light)
 
 
 def test_probes_of_classes_and_values_side_by_side(measured: Pack, tmp_path: Path) -> None:

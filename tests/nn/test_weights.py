@@ -163,6 +163,7 @@ WRONG: dict[str, tuple[Callable[[State], dict[str, Any]], str]] = {
     "a stranger's names": (lambda w: behind("visual.", w), r"\(visual\.conv1.*\) left over"),
     "wider": (lambda w: w | {"bn1.weight": torch.ones(99)}, r"1 tensor \(bn1\.weight \[99\] for \[32\]\) of another"),
     "two": (lambda w: behind("encoder.", w) | behind("backbone.", w), "two sets of weights fit, below 'encoder.' and"),
+    "quantised": (lambda w: w | {"bn1.weight": w["bn1.weight"].to(torch.int8)}, r"1 tensor \(bn1\.weight\) of whole"),
     "nan": (lambda w: w | {"bn1.weight": w["bn1.weight"] * torch.nan}, r"NaN or infinite numbers: 1 tensor \(bn1"),
 }
 

@@ -133,12 +133,23 @@ def test_values_have_r2(measured: Pack) -> None:
     errors, guess = light[0].sum(0).tolist()
     rows = measured.rows("val")
     level = measured.column("level")[rows]
-    assert guess == pytest.approx(((level - level.mean()) ** 2).sum(), rel=1e-4)
+    assert guess == pytest.approx(((level - level.mean()) ** 2).sum() / measured.column("level").var(), rel=1e-4)
     assert values["touch/linear light"] == pytest.approx(1 - errors / guess) and values["touch/linear light"] > 0.5
     assert torch.equal(both[0], light[0])  # the same target; weight has rows of its own
     weight = measured.column("weight")[rows]
     known = weight[~np.isnan(weight)]
-    assert float(both[1, :, 1].sum()) == pytest.approx(((known - known.mean()) ** 2).sum(), rel=1e-4)
+    spread = ((known - known.mean()) ** 2).sum() / np.nanvar(measured.column("weight"))
+    assert float(both[1, :, 1].sum()) == pytest.approx(spread, rel=1e-4)
+
+
+def test_a_value_far_from_zero_has_the_same_r2(measured: Pack) -> None:
+    """In float32 a stamp of today has steps of two minutes."""
+    run, task = smoke(measured), measured.spec.values[0]
+    model, shifted = fresh(run, measured.spec, measured.size), Pack(measured.path)
+    for splits in ((), ("train",), ("val",)):
+        shifted._answers[(repr(task), *splits)] = 1e-9 * (measured.values(task, *splits) + 1e9)
+    scores = [validate(model, pack, run)[0]["touch/linear light"] for pack in (measured, shifted)]
+    assert scores[0] == pytest.approx(scores[1], abs=1e-4)
 
 
 def test_probe_scores_the_best_weights(

@@ -9,7 +9,7 @@ from typing import Any
 
 from mvitac.bench.external import ExternalModel
 from mvitac.bench.external.base import NOTHING
-from mvitac.bench.result import FORM, GUESS, read_signed, sign, write_result
+from mvitac.bench.result import FORM, GUESS, read_signed, sign, write_result, wrong_name
 from mvitac.bench.score import Entry, score_suite
 from mvitac.bench.suite import Suite
 from mvitac.deploy.artifact import load
@@ -37,8 +37,8 @@ class About:
     """Names of all data that it was trained on. Default: what its run or its adapter says."""
 
     def __post_init__(self) -> None:
-        if self.name in (*CONTROLS, GUESS):
-            raise ValueError(f"--name {self.name} is the name of a control: give another")
+        if self.name and (why := wrong_name(self.name, (*CONTROLS, GUESS))):
+            raise ValueError(f"--name: the encoder {why}: give another")
 
 
 def run_bench(places: Sequence[str], suite: Suite, out: Path, root: Path | None, about: About) -> Path:
@@ -91,7 +91,8 @@ def describe(models: Sequence[Model], places: Sequence[str], about: About) -> di
     model, seeds = models[0], [each.seed for each in models]
     external = isinstance(model, ExternalModel)
     names = [m.title for m in models] if external else names_of([Path(place) for place in places], models)
-    if len(set(names)) > 1 or len(set(seeds)) < len(seeds):
+    weights = [each.weights_digest() for each in models]
+    if len(set(names)) > 1 or not len(seeds) == len(set(seeds)) == len(set(weights)):
         raise ValueError(f"{', '.join(places)} are not seeds of one encoder: bench them one by one")
     found = _of_external(model) if isinstance(model, ExternalModel) else _of_run(model, Path(places[0]))
     given = {key: value for key, value in vars(about).items() if value}
@@ -100,7 +101,7 @@ def describe(models: Sequence[Model], places: Sequence[str], about: About) -> di
         **given,
         "size": max(model.sides(m)[0] for m in model.encoders),
         "seeds": seeds,
-        "weights": [each.weights_digest() for each in models],
+        "weights": weights,
         "parameters": {m: sum(p.numel() for p in trunk.parameters()) for m, trunk in model.encoders.items()},
     }
 

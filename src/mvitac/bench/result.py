@@ -16,6 +16,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from mvitac.bench.external.base import parse
 from mvitac.bench.suite import Suite, SuiteSet, SuiteTask, find_suite, pinned, shipped
 from mvitac.evaluation import few_labels
 from mvitac.evaluation.controls import CONTROLS
+from mvitac.evaluation.leaks import declared_leak
 from mvitac.evaluation.probe import VALUE_PROBES
 from mvitac.evaluation.value_scores import SUMS, r_squared
 from mvitac.registry import from_json
@@ -37,6 +39,63 @@ COUNTS = ("n", "correct")  # sums per group of classes: rows, and those that are
 ABOUT_ROWS = ("n", "value", "squared_value")  # sums that depend on the rows alone
 VERSION = re.compile(r"-v\d+$")  # at the end of a suite's name
 GUESS = "majority or mean"  # what the page calls these two controls
+MAX_NAME = 200
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Encoder:
+    """The fields of a result's encoder, and their kinds."""
+
+    name: str
+    licence: str | None
+    trained_on: str | None
+    images_seen: int | None
+    size: int
+    seeds: tuple[int | None, ...]
+    weights: tuple[str, ...]
+    parameters: dict[str, int]
+    features: dict[str, int] = field(default_factory=dict)
+    method: str = ""
+    external: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Record:
+    source: str
+    seed: int | None
+    modality: str
+    probe: str
+    sums: dict[str, list]  # type: ignore[type-arg]
+    targets: tuple[tuple[str, str], ...] = ()
+    clipped: tuple[int, int] = (0, 0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Block:
+    set: str
+    task: str
+    not_run: str = ""
+    form: str = ""
+    data: dict[str, str] = field(default_factory=dict)
+    group_by: str = ""
+    groups: tuple[str, ...] = ()
+    leaks: tuple[str, ...] = ()
+    left_out: dict[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    records: tuple[_Record, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Result:
+    format: str
+    format_version: int
+    suite: dict[str, Any]
+    suite_digest: str
+    encoder: _Encoder
+    versions: dict[str, str]
+    blocks: tuple[_Block, ...]
+    digest: str
+    about: dict[str, Any]
 
 
 def kept(record: dict[str, Any]) -> dict[str, Any]:
@@ -116,9 +175,10 @@ def read_result(path: Path) -> dict[str, Any]:
     """Read a result of a suite of tasks; ValueError also if its suite is not that of this version."""
     value = read_signed(path)
     try:
+        from_json(_Result, value, "result")
         suite = suite_of(value)
-    except (KeyError, ValueError) as error:
-        raise ValueError(f"{path} has no valid suite ({error}): run the bench again") from None
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged ({error}): run the bench again") from None
     if value.get("suite_digest") != suite.digest():
         raise ValueError(f"{path}: the suite inside does not have the digest that the file says: run the bench again")
     if suite.name in shipped() and find_suite(suite.name).digest() != suite.digest():
@@ -150,20 +210,31 @@ def problems(value: dict[str, Any]) -> list[str]:
     asked = [(one, ask) for one in suite.sets for ask in one.tasks]
     if (want := [(s.name, t.name) for s, t in asked]) != (have := [(b["set"], b["task"]) for b in value["blocks"]]):
         return [*found, f"has the tasks {have}, the suite asks for {want}"]
+    trunks = {any(r["source"] == "imagenet" for r in b["records"]) for b in value["blocks"] if "records" in b}
+    if len(trunks) != 1:
+        found.append("has the control imagenet in some tasks only" if trunks else "was run on no task")
     for block, (one, ask) in zip(value["blocks"], asked, strict=True):
         if "not_run" not in block:
             found += [f"{one.name}, {ask.name}: {text}" for text in _of_block(block, suite, one, ask, encoder)]
     return found
 
 
+def wrong_name(name: str, controls: Sequence[str]) -> str:
+    """What an encoder cannot be called; "" if it can."""
+    if name.strip().casefold() in controls:
+        return f"has the name of a control, {name!r}"
+    return "" if name.strip() and name.isprintable() and len(name) <= MAX_NAME else f"has the name {name[:MAX_NAME]!r}"
+
+
 def problems_of(encoder: dict[str, Any], controls: Sequence[str]) -> Iterator[str]:
     """What a result cannot say of its encoder."""
-    if encoder["name"] in controls:
-        yield f"the encoder has the name of a control, {encoder['name']!r}: give --name"
-    if (seen := encoder["images_seen"]) is not None and not (isinstance(seen, int) and seen >= 0):
-        yield f"images_seen is {seen}"
-    if not len(encoder["seeds"]) == len(set(encoder["seeds"])) == len(encoder["weights"]):
-        yield f"has {len(encoder['weights'])} weights for seeds {encoder['seeds']}"
+    if why := wrong_name(encoder["name"], controls):
+        yield f"the encoder {why}: give --name"
+    seeds, weights = encoder["seeds"], encoder["weights"]
+    numbers = {"images_seen": encoder["images_seen"] or 0, "size": encoder["size"], **encoder["parameters"]}
+    yield from (f"{key} is {number}" for key, number in numbers.items() if not 0 <= number < 1e18)
+    if not len(seeds) == len(set(seeds)) == len(set(weights)) == len(weights):
+        yield f"has {len(set(weights))} weights for seeds {seeds}"
 
 
 def _of_block(
@@ -176,6 +247,10 @@ def _of_block(
         yield "the data has other rows, labels or splits than the suite"
     if len(block["leaks"]) != len(encoder["seeds"]):
         yield f"has {len(block['leaks'])} leak marks for {len(encoder['seeds'])} seeds"
+    if "external" in encoder and {*block["leaks"]} != {declared_leak(encoder["trained_on"], one.names)}:
+        yield f"its marks of leaks are not those of data trained on, {encoder['trained_on']}"
+    if len({*block["groups"]}) < len(block["groups"]):
+        yield "a group is there twice"
     if encoder["name"] in {record["source"] for record in records}:
         yield f"the encoder has the name of a control, {encoder['name']!r}: give --name"
     have = Counter((r["source"], r["modality"], r["probe"], r["seed"]) for r in records)
@@ -191,7 +266,7 @@ def _of_block(
             yield f"{what}: is there twice"
         if why := _impossible(record, len(block["groups"])):
             yield f"{what}: {why}"
-        scored = [record["sums"][name] for name in ABOUT_ROWS if name in record["sums"]]
+        scored = [record.get("targets"), *(record["sums"][name] for name in ABOUT_ROWS if name in record["sums"])]
         if rows.setdefault(record["modality"], scored) != scored:
             yield f"{what}: is scored on other rows than those above it"
 
@@ -217,11 +292,11 @@ def _expected(suite: Suite, ask: SuiteTask, block: dict[str, Any], seeds: Sequen
 def _impossible(record: dict[str, Any], num_groups: int) -> str:
     """Why no predictions give the sums of a record; "" if some do."""
     names = SUMS if "targets" in record else COUNTS
-    if record.keys() - {"targets", "clipped"} != {*KEY, "sums"} or {*record["sums"]} != {*names}:
-        return f"its fields are {sorted(record)}, its sums {sorted(record['sums'])}"
+    if {*record["sums"]} != {*names}:
+        return f"its sums are {sorted(record['sums'])}"
     try:
         sums = {name: np.array(record["sums"][name], float) for name in names}
-    except ValueError:
+    except (TypeError, ValueError):
         return "its sums are no numbers"
     n = sums["n"] = np.atleast_2d(sums["n"])
     if any(np.atleast_2d(each).shape != n.shape for each in sums.values()) or n.shape[1] > num_groups:
@@ -240,7 +315,10 @@ def _impossible(record: dict[str, Any], num_groups: int) -> str:
     if "targets" not in record:
         return "it has more correct rows than rows" if (sums["correct"] > n).any() else ""
     least = 1 - 1e-6  # sums have ten digits
-    if (sums["error"] < 0).any() or (sums["squared_error"] * n < least * sums["error"] ** 2).any():
-        return "its squared errors are smaller than its errors allow"
+    low, high = sums["error"] ** 2 / np.maximum(n, 1), sums["error"] ** 2
+    if (sums["error"] < 0).any() or (
+        (sums["squared_error"] < least * low) | (least * sums["squared_error"] > high)
+    ).any():
+        return "its squared errors are smaller or larger than its errors allow"
     small = (sums["squared_value"] * n < least * sums["value"] ** 2).any()
     return "its squares are smaller than its values allow" if small else ""

@@ -132,9 +132,9 @@ class Scored:
                 found.append(f"{num_rows} of {len(rows)} test rows{grouped} were trained on ({source.name})")
         rest = [source.name for source in sources if not len(source.ids)]
         said = [name.removeprefix(DECLARED) for name in rest if name.startswith(DECLARED)]
-        declared = (declared_leak(text, names or [self.pack.spec.name.split(" (")[0]]) for text in said)
-        found += dict.fromkeys(filter(None, declared))
-        unknown = len(rest) > len(said)
+        declared = dict.fromkeys(declared_leak(text, names or [self.pack.spec.name.split(" (")[0]]) for text in said)
+        unknown = len(rest) > len(said) or UNKNOWN in declared
+        found += [leak for leak in declared if leak not in ("", UNKNOWN)]
         return "; ".join(found) or (UNKNOWN if unknown else "")
 
 
@@ -143,10 +143,10 @@ def declared_leak(trained_on: str | None, names: Sequence[str]) -> str:
 
     ``UNKNOWN`` if the owner does not. Blanks, signs and upper case do not count: "Touch and Go" is "touch-and-go".
     """
-    if trained_on is None or trained_on == UNKNOWN:
-        return UNKNOWN
-    named = [name for name in names if _letters(name) and _letters(name) in _letters(trained_on)]
-    return f"{named[0]} was in its owner's training, which rows is not known" if named else ""
+    said = [*map(_letters, (trained_on or "").split(";"))]
+    if named := [name for name in names if _letters(name) and _letters(name) in "".join(said)]:
+        return f"{named[0]} was in its owner's training, which rows is not known"
+    return UNKNOWN if UNKNOWN in said or not any(said) else ""
 
 
 def _letters(text: str) -> str:

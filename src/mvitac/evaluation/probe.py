@@ -94,12 +94,16 @@ def scorable(pack: Pack, modality: str = "none") -> list[AnyTask]:
 
 
 def _check_measured(values: np.ndarray, task: ValueTask, rows: dict[str, np.ndarray]) -> None:
-    """Check that each target has two different values in each of ``rows``: without them it has no R2."""
+    """Check that each target has two different values in each of ``rows``, which float64 can square: it has an R2."""
     for t, target in enumerate(task.targets):
         for split, mine in rows.items():
-            if len(np.unique(values[mine, t][np.isfinite(values[mine, t])])) < 2:
+            known = values[mine, t][np.isfinite(values[mine, t])]
+            if len(np.unique(known)) < 2:
                 why = f"{target.name} has fewer than two different values in split {split}"
                 raise ValueError(f"task {task.name!r}: {why}: nothing to probe, leave it out or split otherwise")
+            if not (1e-60 < (most := abs(known).max()) < 1e60 and known.std() > 1e-6 * most):
+                why = f"{target.name} is from {known.min():.6g} to {known.max():.6g} in split {split}"
+                raise ValueError(f"task {task.name!r}: {why}: rounding would decide R2, subtract an offset or scale it")
 
 
 def names_in(modality: str, pack: Pack) -> tuple[str, ...]:

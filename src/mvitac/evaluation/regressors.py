@@ -104,7 +104,7 @@ def _fit_each(x: np.ndarray, y: np.ndarray, num_val: int, before: Pipeline) -> L
         whole = before.fit(x).transform(x)
         for target in y.T:
             have = ~np.isnan(target)
-            mean, std = float(target[have].mean()), float(target[have].std()) + 1e-12
+            mean, std = float(target[have].mean()), float(target[have].std()) or 1.0
             scaled = (target - mean) / std
             alpha = _strength(part, scaled, have & first, have & ~first)
             ridges.append((Ridge(alpha).fit(whole[have], scaled[have]), mean, std))

@@ -74,7 +74,8 @@ def one_target(record: dict[str, Any], t: int) -> dict[str, Any]:
 def r_squared(sums: dict[str, Any]) -> Any:
     """R2 from ``SUMS`` (numbers or arrays): 1 - squared error / squared deviation from the mean of the same rows."""
     spread = sums["squared_value"] - sums["value"] ** 2 / np.maximum(sums["n"], 1)
-    return 1 - sums["squared_error"] / np.maximum(spread, 1e-12)
+    least = np.finfo(float).eps * sums["squared_value"] + 1e-130  # less is rounding
+    return 1 - sums["squared_error"] / np.maximum(spread, least)
 
 
 def error_by_range(true: np.ndarray, error: np.ndarray, num: int = NUM_RANGES) -> list[dict[str, float]]:

@@ -188,11 +188,12 @@ def adapt_stem(weight: Float[Tensor, "O C h w"], channels: int) -> Float[Tensor,
 
 def misfit(expected: State, found: dict[str, Any]) -> str:
     """Say in which names or shapes tensors differ from the ``expected`` ones, with counts and first names; "" if in none."""
-    pairs = [(name, [*found[name].shape], [*value.shape]) for name, value in expected.items() if name in found]
+    both = [(name, found[name], own) for name, own in expected.items() if name in found]
     wrong = {
         "missing": [name for name in expected if name not in found],
         "left over": [name for name in found if name not in expected],
-        "of another shape": [f"{name} {other} for {own}" for name, other, own in pairs if other != own],
+        "of another shape": [f"{n} {[*a.shape]} for {[*b.shape]}" for n, a, b in both if a.shape != b.shape],
+        "of whole numbers": [n for n, a, b in both if b.is_floating_point() and not a.is_floating_point()],
     }
     return ", ".join(f"{_some(names)} {what}" for what, names in wrong.items() if names)
 

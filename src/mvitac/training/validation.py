@@ -167,9 +167,14 @@ def _linear(
 
 
 def _answers(pack: Pack, task: AnyTask, split: str, rows: np.ndarray) -> list[Tensor]:
-    """What a probe fits: one column per class of a task, or one column for each value on its own; NaN = not known."""
+    """What a probe fits: one column per class of a task, or one column for each value on its own; NaN = not known.
+
+    Values are standardised, which changes no R2, so that float32 holds them.
+    """
     if not isinstance(task, Task):
-        return [torch.from_numpy(column[rows, None]).float() for column in pack.values(task, split).T]
+        every = pack.values(task)
+        scaled = (pack.values(task, split)[rows] - np.nanmean(every, axis=0)) / (np.nanstd(every, axis=0) + 1e-100)
+        return [torch.from_numpy(column[:, None]).float() for column in scaled.T]
     labels = torch.from_numpy(pack.labels(task.name, split))[rows]
     columns = torch.nn.functional.one_hot(labels.clamp(min=0), len(task.classes)).float()
     columns[labels < 0] = torch.nan

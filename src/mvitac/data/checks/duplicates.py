@@ -38,10 +38,10 @@ def exact_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
 def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     """Find rows of val and test that are nearly identical to a row of train.
 
-    Each thumbnail is reduced to its residual (see ``residuals``); two rows are near-duplicates if these correlate by at
-    least a threshold. The threshold is halfway between 1 and the most similar rows of two *groups inside train*, at most
-    ``NEAR``. The fraction of train rows above it measures how similar rows of this dataset are by nature, for example
-    frames without contact.
+    Each thumbnail is reduced to its residual (``Residuals``); two rows are near-duplicates if these correlate by at least a
+    threshold. The threshold is halfway between 1 and the most similar rows of two *groups inside train*, at most ``NEAR``.
+    The fraction of train rows above it measures how similar rows of this dataset are by nature, for example frames without
+    contact.
     """
     sides = sides_of(pack.column("split").astype(str))
     groups = pack.column("group").astype(str)
@@ -51,14 +51,14 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         if not held_out.any() or not (one.has & ~held_out).any():
             notes.append(f"{name}: all in one split")
             continue
-        unit, clear = residuals(one, pack.sensors)
-        asked = _some(np.flatnonzero(clear & (sides != "train")), MAX_ASKED)
-        bank = _some(np.flatnonzero(clear & (sides == "train")), MAX_SEARCHED)
+        residuals = Residuals(one, pack.sensors)
+        asked = _some(np.flatnonzero(residuals.clear & (sides != "train")), MAX_ASKED)
+        bank = _some(np.flatnonzero(residuals.clear & (sides == "train")), MAX_SEARCHED)
         if not len(asked) or not len(bank):
             notes.append(f"{name}: too faint to compare")
             continue
         compared = True
-        pairs, base = _near_pairs(unit, asked, bank, groups, one.exact)
+        pairs, base = _near_pairs(residuals, asked, bank, groups, one.exact)
         rate = len(pairs) / len(asked)
         notes.append(
             f"{name}: {share(len(pairs), len(asked))} of held-out rows nearly repeat one of train"
@@ -73,52 +73,73 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     return judged(item, evidence, advice, rows, look=suspicious)
 
 
+class Residuals:
+    """What is specific to each thumbnail.
+
+    That is its brightness minus the median thumbnail of a sensor (a gel's background, a fixed camera's scene), minus its own
+    blur (lamps that drift).
+    """
+
+    def __init__(self, one: ImageStats, sensors: np.ndarray) -> None:
+        self.sensors = sensors
+        self.sharp = _sharp(one.fine)
+        self.backgrounds = np.zeros((sensors.max() + 1, self.sharp.shape[1]), np.float32)
+        self.clear = one.has.copy()  # bool [N], those that are more than noise
+        for sensor in np.unique(sensors[one.has]):
+            mine = np.flatnonzero((sensors == sensor) & one.has)
+            self.backgrounds[sensor] = _sharp(np.median(one.fine[_some(mine, 2000)], axis=0)[None])[0]
+            self.clear[mine] = (self.sharp[mine] - self.backgrounds[sensor]).std(axis=1) > FAINT
+
+    def units(self, rows: np.ndarray, sensor: int) -> np.ndarray:
+        """Unit vectors of ``rows`` as if ``sensor`` had seen them: a copy may be said to be of another one, or of none."""
+        found = self.sharp[rows] - self.backgrounds[sensor]
+        return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-6)
+
+    def nearest(
+        self, asked: np.ndarray, bank: np.ndarray, apart: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return each asked row's nearest of ``bank``, and their correlation.
+
+        With ``apart``, among other values of it and of the row's own sensor: what another pack holds may be copies.
+        """
+        best, value = np.zeros(len(asked), int), np.full(len(asked), -1.0)
+        for sensor in np.unique(self.sensors[bank]):
+            mine = bank[self.sensors[bank] == sensor]
+            known = self.units(mine, sensor).T
+            for start in range(0, len(asked), 256):
+                at = slice(start, start + 256)
+                similar = self.units(asked[at], sensor) @ known
+                if apart is not None:
+                    other = self.sensors[asked[at]] != sensor
+                    similar[(apart[asked[at]][:, None] == apart[mine][None, :]) | other[:, None]] = -1
+                most = similar.max(1)
+                best[at] = np.where(most > value[at], mine[similar.argmax(1)], best[at])
+                value[at] = np.maximum(most, value[at])
+        return best, value
+
+
+def _sharp(images: np.ndarray) -> np.ndarray:
+    """[N, F, F] minus their blur and mean: [N, F * F]."""
+    light = images.astype(np.float32)
+    light -= uniform_filter1d(uniform_filter1d(light, BLUR, axis=1), BLUR, axis=2)
+    light = light.reshape(len(light), -1)
+    return light - light.mean(axis=1, keepdims=True)
+
+
 def _near_pairs(
-    unit: np.ndarray, asked: np.ndarray, bank: np.ndarray, groups: np.ndarray, exact: np.ndarray
+    residuals: Residuals, asked: np.ndarray, bank: np.ndarray, groups: np.ndarray, exact: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Pairs of rows [n, 2] that are near-duplicates, one of ``asked`` and one of ``bank``, the most similar first.
 
     Exact copies are left out. Also returns how common near-duplicates are between groups of ``bank``.
     """
-    best, value = _nearest(unit, asked, bank)
-    _, natural = _nearest(unit, _some(bank, 500), bank, apart=groups)
+    best, value = residuals.nearest(asked, bank)
+    _, natural = residuals.nearest(_some(bank, 500), bank, apart=groups)
     near = float(np.clip((1 + natural.max()) / 2, NEAR_AT_LEAST, NEAR)) if natural.max() > -1 else NEAR
-    hit = (value >= near) & (exact[asked] != exact[bank[best]])
+    hit = (value >= near) & (exact[asked] != exact[best])
     order = np.argsort(-value[hit])
-    return np.stack([asked[hit][order], bank[best][hit][order]], axis=1), float((natural >= near).mean())
-
-
-def residuals(one: ImageStats, sensors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit vectors [N, F * F] of what is specific to each thumbnail, and which [N] are more than noise.
-
-    A residual is the brightness minus the median thumbnail of the sensor (a gel's background, a fixed camera's scene),
-    minus its own blur (lamps that drift).
-    """
-    light = one.fine.astype(np.float32)
-    for sensor in np.unique(sensors[one.has]):
-        mine = (sensors == sensor) & one.has
-        light[mine] -= np.median(light[mine][_some(np.arange(int(mine.sum())), 2000)], axis=0)
-    light -= uniform_filter1d(uniform_filter1d(light, BLUR, axis=1), BLUR, axis=2)
-    light = light.reshape(len(light), -1)
-    light -= light.mean(axis=1, keepdims=True)
-    clear = one.has & (light.std(axis=1) > FAINT)
-    return light / np.maximum(np.linalg.norm(light, axis=1, keepdims=True), 1e-6), clear
+    return np.stack([asked[hit][order], best[hit][order]], axis=1), float((natural >= near).mean())
 
 
 def _some(rows: np.ndarray, num: int) -> np.ndarray:
     return rows if len(rows) <= num else rows[np.linspace(0, len(rows) - 1, num).astype(int)]
-
-
-def _nearest(
-    unit: np.ndarray, asked: np.ndarray, bank: np.ndarray, apart: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return each asked row's nearest in ``bank`` (index, correlation); with ``apart``, only among other values of it."""
-    best, value = np.zeros(len(asked), int), np.full(len(asked), -1.0)
-    for start in range(0, len(asked), 256):
-        at = slice(start, start + 256)
-        similar = unit[asked[at]] @ unit[bank].T
-        if apart is not None:
-            similar[apart[asked[at]][:, None] == apart[bank][None, :]] = -1
-        best[at] = similar.argmax(1)
-        value[at] = similar.max(1)
-    return best, value
