@@ -20,7 +20,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -28,10 +27,8 @@ import safetensors.torch
 import torch
 from PIL import Image
 
-import mvitac
 from mvitac.cli.main import main
 from mvitac.data import build as packing
-from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
@@ -44,7 +41,6 @@ from mvitac.system.files import write_json
 from mvitac.training.loop import train
 from mvitac.training.views import StepViews
 from support.forged_packs import Spoil, described, edited, seal
-from support.toy import Toy
 
 
 class WorkBegan(AssertionError):
@@ -407,102 +403,3 @@ def test_full_disk(
     fill_disk(monkeypatch, name)
     refused(command, name, "No space left on device", left=tuple(left.split()), work=True)
     assert not (tmp_path / "out" / MODEL).exists() and not list(tmp_path.rglob("*.tmp"))
-
-
-# -- samples of a reader ----------------------------------------------------------------------------------------------
-
-
-@dataclasses.dataclass
-class Spoilt(Toy):
-    """The toy with one part of sample 3 changed."""
-
-    num: int = 40
-    part: str = ""
-    value: Any = None
-
-    def read(self, item: int) -> list[Any]:
-        (sample,) = super().read(item)
-        if item != 3:
-            return [sample]
-        if self.part in ("vision", "touch"):
-            return [replace(sample, **{self.part: self.value})]
-        return [replace(sample, columns={**sample.columns, self.part: self.value})]
-
-
-@pytest.mark.parametrize(
-    ("part", "value", "says"),
-    [
-        ("touch", np.zeros((32, 32, 3)), "float64"),
-        ("vision", np.zeros((32, 32), np.uint8), r"\(32, 32\)"),
-        ("label_pattern", 7, "label_pattern is 7.*0 to 2"),
-        ("split", "tset", "did you mean 'test'"),
-        ("group", None, "group"),
-        ("id", "0004", "twice"),
-        ("noise", "loud", "noise"),
-    ],
-)
-def test_bad_samples_make_no_pack(tmp_path: Path, part: str, value: Any, says: str) -> None:
-    with pytest.raises(ValueError, match=says):
-        build(Spoilt(part=part, value=value), tmp_path / "p", size=32, quiet=True)
-    assert not (tmp_path / "p").exists()
-
-
-# -- random damage ----------------------------------------------------------------------------------------------------
-
-NUM_DAMAGES = 40
-
-
-def damaged(data: bytes, rng: np.random.Generator) -> bytes:
-    """One byte changed, a stretch zeroed, or the end cut off, at a random place."""
-    place, kind = int(rng.integers(len(data))), int(rng.integers(4))
-    if kind == 0:
-        return data[:place]
-    length = min(int(rng.integers(1, 64)), len(data) - place)
-    if kind == 1:
-        return data[:place] + bytes(length) + data[place + length :]
-    changed = data[place] ^ int(rng.integers(1, 256)) if kind == 2 else int(rng.integers(32, 127))  # 3: still text
-    return data[:place] + bytes([changed]) + data[place + 1 :]
-
-
-def content(pack: Pack) -> Any:
-    images = {m: hashlib.sha256(np.ascontiguousarray(a).tobytes()).hexdigest() for m, a in pack.images.items()}
-    return pack.spec, pack.num, pack.size, pack.digest, pack.table.to_pydict(), images
-
-
-def in_one_line(error: ValueError) -> int:
-    assert "\n" not in str(error)
-    return 1
-
-
-@pytest.mark.parametrize("name", PACK_FILES)
-def test_random_damage_to_a_pack(pack: Pack, tmp_path: Path, name: str) -> None:
-    """Opening says what is wrong in one line, or gives the very same content."""
-    good, path = content(pack), tmp_path / "p"
-    path.mkdir()
-    for file in PACK_FILES:
-        (path / file).symlink_to(pack.path / file)
-    (path / name).unlink()
-    data, rng, noticed = (pack.path / name).read_bytes(), np.random.default_rng(11), 0
-    for _ in range(NUM_DAMAGES):
-        (path / name).write_bytes(damaged(data, rng))
-        try:
-            assert content(Pack(path)) == good
-        except ValueError as error:
-            noticed += in_one_line(error)
-    assert noticed > NUM_DAMAGES // 2
-
-
-def test_random_damage_to_a_model(finished: Path, tmp_path: Path) -> None:
-    model, path, rng, noticed = mvitac.load(finished), tmp_path / MODEL, np.random.default_rng(12), 0
-    data = (finished / MODEL).read_bytes()
-    header = 8 + int.from_bytes(data[:8], "little")
-    for i in range(2 * NUM_DAMAGES):  # every other one in the header, which is the smaller part
-        part = damaged(data[:header], rng) + data[header:] if i % 2 else damaged(data, rng)
-        path.write_bytes(part)
-        try:
-            again = mvitac.load(path)
-            assert again.run == model.run and again.spec == model.spec
-            assert again.weights_digest() == model.weights_digest()
-        except ValueError as error:
-            noticed += in_one_line(error)
-    assert noticed > NUM_DAMAGES

@@ -125,7 +125,13 @@ def test_the_page_in_a_browser(address: str, pack: Pack, tmp_path: Path) -> None
     """The script draws every test row."""
     if not CHROMIUM:
         pytest.skip("no Chromium on the PATH: the page is not tested (apt-get install chromium)")
-    flags = ["--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--virtual-time-budget=60000"]
+    flags = [
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-dev-shm-usage",
+        "--virtual-time-budget=60000",
+    ]
     command = [CHROMIUM, *flags, f"--user-data-dir={tmp_path}", "--dump-dom", address]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert f'data-points="{len(pack.rows("test"))}"' in done.stdout, done.stderr[-2000:]

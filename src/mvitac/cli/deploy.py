@@ -25,14 +25,10 @@ class _PublishOptions:
     """Fit the probes on this pack instead of the data the run was trained on."""
     allow_leak: bool = False
     """Score also rows or groups of --on that the run was trained on; the card says LEAK beside such scores."""
-    push: str | None = None
-    """Also upload the folder to the Hugging Face Hub under this name (owner/name); needs `hf auth login`."""
-    private: bool = False
-    """Make the uploaded repository private."""
 
 
 def publish(argv: list[str]) -> None:
-    """mvitac publish RUN OUT [--on PACK] [--push OWNER/NAME]"""
+    """mvitac publish RUN OUT [--on PACK]"""
     options = parse(_PublishOptions, argv, "publish")
     check_models(options.run)
     loading()
@@ -44,9 +40,7 @@ def publish(argv: list[str]) -> None:
         pack = Pack(options.on) if options.on else None
         out = publish.publish(options.run, options.out, pack, allow_leak=options.allow_leak)
     print_summary(ARTIFACT.read(out)["scores"])
-    print(f"written: {out}")
-    if options.push:
-        print(f"pushed: {publish.push(out, options.push, private=options.private)}")
+    print(f"written: {out}\nto the Hub: hf upload OWNER/NAME {out}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,8 +55,6 @@ class _ExportOptions(ExportConfig):
     on: Path | None = None
     """Pack whose test rows check the export, and on which the probes of a run are fitted; an artifact keeps its own
     (default: the data the model was trained on)."""
-    calibrate: Path | None = None
-    """Pack whose train rows set the ranges of int8 (default: the pack that checks)."""
     new_sensor: Path | None = None
     """Pack with 64 to 400 unlabelled images of a touch sensor that the model never met, such as a recording of mvitac
     live: the export is for that sensor, and shows its images in the colours of the known ones."""
@@ -86,9 +78,8 @@ def export(argv: list[str]) -> None:
     pack = Pack(options.on) if options.on else own_data(model, how, few=bool(model.probes))
     pack = as_trained(model, pack)
     with shown():
-        calibrate = as_trained(model, Pack(options.calibrate)) if options.calibrate else None
         new = Pack(options.new_sensor) if options.new_sensor else None
-        report = export(with_probes(model, pack), pack, options.out, options, calibrate=calibrate, new=new)
+        report = export(with_probes(model, pack), pack, options.out, options, new=new)
     title = f"{options.out}: checked on {report['num_rows']} {f'rows of {new.path}' if new else 'test rows'}"
     print(text_table(title, ["", "original", "export"], _rows(report)))
 

@@ -12,7 +12,6 @@ from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
 from mvitac.evaluation.probe_config import ProbeConfig
 from mvitac.shipped import BASE
-from mvitac.system.files import read_json
 from mvitac.system.progress import shown
 
 
@@ -82,27 +81,24 @@ def probe(argv: list[str]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _ReportOptions:
-    """One self-contained HTML page about finished runs, and its figures as PNG."""
+    """One self-contained HTML page about finished runs, and its figures as PNG. Scores are those that `mvitac probe RUN...`
+    left in the first run's folder (probe.json); if they are missing or incomplete, the runs are probed now."""
 
     runs: Positional[tuple[Path, ...]]
     """Folder of each finished run: seeds of one method, or several methods, on the same data."""
     out: Path | None = None
     """Folder of the page (default: report inside the run's folder; runs/report for several runs)."""
-    probe: Path | None = None
-    """Scores of these runs, as `mvitac probe RUN... --json FILE` wrote them. Default: the probe.json that `mvitac probe
-    RUN...` left in the first run's folder; if that is missing or incomplete, the runs are probed now."""
     quiet: bool = False
     """No progress."""
 
 
 def report(argv: list[str]) -> None:
-    """mvitac report RUN... [--out DIR] [--probe FILE.json]"""
+    """mvitac report RUN... [--out DIR]"""
     options = parse(_ReportOptions, argv, "report")
     check_models(*options.runs)
-    result = read_json(options.probe, "a probe result") if options.probe else None
     loading()
     from mvitac.report.report import write_report
 
     alone = len(options.runs) == 1 and options.runs != (BASE,)  # nothing is written into the package
     out = options.out or (options.runs[0] / "report" if alone else Path("runs") / "report")
-    print(f"written: {write_report(options.runs, out, result=result, quiet=options.quiet)}")
+    print(f"written: {write_report(options.runs, out, quiet=options.quiet)}")

@@ -82,10 +82,6 @@ class DatasetConfig(Registered):
         """Return the source of samples; ValueError if the data does not exist, or is packed already."""
         raise ValueError(f"--data {self.name} reads packs: there is nothing to pack, use it to train and to probe")
 
-    def on_new_sensor(self) -> "DatasetConfig | None":
-        """Some of the same groups, touched with a sensor that this dataset never shows; None if there is none."""
-        return None
-
     def place(self, source: "Source | None" = None) -> Path:
         """Return the folder in the cache where ``open`` builds the pack of ``source``, by default of this dataset."""
         source = source or self.source()

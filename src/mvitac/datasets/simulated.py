@@ -5,7 +5,7 @@ They are the default data: every experiment runs without a download. Results are
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -108,13 +108,6 @@ class MaterialsConfig(PressConfig):
         super().__post_init__()
         check_range(self, 1, math.inf, "touches")
         check_range(self, 1, len(self.choice()), "sensors_per_press")
-
-    def on_new_sensor(self) -> "MaterialsConfig | None":
-        if self.held_out_sensor:
-            return None
-        few = min(-(-self.num // self.touches), 600)  # one touch of each of the first 600 instances at most
-        once = {"num": few, "touches": 1, "sensors_per_press": 1}
-        return replace(self, **once, makes=(), sensors=0, held_out_sensor=True)
 
     def source(self) -> Source:
         self.check_installed()

@@ -9,7 +9,6 @@ import io
 import logging
 import warnings
 from collections.abc import Iterator
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from mvitac.deploy.export_config import ExportConfig
 from mvitac.deploy.export_module import ExportModule, write_onnx
 from mvitac.deploy.parity import latency, parity, reference
 from mvitac.deploy.quantise import quantise
-from mvitac.evaluation.features import sample
+from mvitac.evaluation.features import fitting, sample
 from mvitac.evaluation.sensors import learn_looks
 from mvitac.model import Model
 from mvitac.system.device import has_bf16
@@ -44,16 +43,15 @@ def export(
     out: Path,
     config: ExportConfig = ExportConfig(),
     *,
-    calibrate: Pack | None = None,
     new: Pack | None = None,
 ) -> dict[str, Any]:
     """Write ``model`` with its probes as ONNX into the new folder ``out``, checked on test rows of ``pack``.
 
-    ``calibrate``: data whose train rows set the ranges of int8 (default: ``pack``). ``new``: unlabelled images of a touch
-    sensor that ``pack`` lacks. The export is then for that sensor, whose images it shows in the colours of those of
-    ``pack``, and is checked on ``new`` (all rows, if none is of split test). Returns the report: cosines, accuracies,
-    errors of values in their units, size in MB, latency in ms. Raises Busy if another process writes ``out``; ValueError
-    if the export is not possible, or differs by more than ``config`` allows.
+    Its train rows set the ranges of int8. ``new``: unlabelled images of a touch sensor that ``pack`` lacks. The export is
+    then for that sensor, whose images it shows in the colours of those of ``pack``; its ranges and the check are of
+    ``new`` (all rows, if none is of split test). Returns the report: cosines, accuracies, errors of values in their
+    units, size in MB, latency in ms. Raises Busy if another process writes ``out``; ValueError if the export is not
+    possible, or differs by more than ``config`` allows.
     """
     if config.precision == "bf16" and not has_bf16(torch.device("cpu")):
         raise ValueError("--precision bf16: this CPU does not compute bf16 itself, so it could not be checked")
@@ -61,8 +59,10 @@ def export(
     known, pack = pack, new or pack
     if new and "touch" not in asked:
         raise ValueError(f"{NEW_SENSOR} is about touch, which this export lacks: leave it out")
-    for given, modality in product((known, pack, calibrate or pack), asked):
-        _check_fits(model, given, modality)
+    for given in (known, pack):
+        if {*fitting(model, given, asked)} != {*asked} or given.size != model.stored:
+            what = f"{' and '.join(asked)} at {model.stored} px"
+            raise ValueError(f"{given.path} cannot check this model: it needs images of {what}")
     graph = ExportModule(model, asked, learn_looks(known, new, NEW_SENSOR) if new else None)
     rows = pack.rows("test", having=asked)
     if new and not len(rows):
@@ -74,7 +74,7 @@ def export(
         with work("writing ONNX"), silent():
             write_onnx(graph, partial / MODEL)
             if config.precision == "int8":
-                quantise(partial / MODEL, list(graph.inputs), _examples(graph, calibrate or pack))
+                quantise(partial / MODEL, list(graph.inputs), _examples(graph, pack))
         report, wanted = _measure(model, graph, partial / MODEL, pack, rows, config)
         # A few real inputs and the outputs of the trained model, which ``Engine`` repeats where it is opened.
         some = np.linspace(0, len(rows) - 1, min(len(rows), NUM_CHECK)).astype(int)
@@ -91,16 +91,6 @@ def export(
         }
         EXPORT.write(partial, {**about, "provenance": provenance()})
     return report
-
-
-def _check_fits(model: Model, pack: Pack, modality: str) -> None:
-    """ValueError if ``model`` takes no ``modality``, or ``pack`` does not hold images of it as ``model`` wants them."""
-    model.check_modality(modality)
-    channels, difference = model.spec.channels(modality), modality == "touch" and model.spec.difference
-    fits = (modality in pack.spec.modalities, pack.spec.channels(modality) == channels, pack.size == model.stored)
-    if not all(fits) or (difference and not pack.spec.difference):
-        what = f"{channels} channels at {model.stored} px{' minus their background' * difference}"
-        raise ValueError(f"{pack.path} cannot check this model: it needs {modality} images of {what}")
 
 
 def _examples(graph: ExportModule, pack: Pack) -> list[list[np.ndarray]]:

@@ -11,7 +11,7 @@ import torch
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, ValueTask
 from mvitac.datasets.simulated import SimulatedConfig
-from mvitac.deploy.artifact import ARTIFACT, HUB_ID, preprocessing, read
+from mvitac.deploy.artifact import ARTIFACT, preprocessing, read
 from mvitac.deploy.card import card
 from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import as_trained, check_unseen, stored_result
@@ -199,15 +199,3 @@ def _describe(model: Model, pack: Pack) -> dict[str, Any]:
         "data": {**{key: getattr(pack.spec, key) for key in keys}, "digest": pack.digest},
         "trained_on": {key: getattr(model.spec, key) for key in keys},
     }
-
-
-def push(artifact: Path, repo: str, *, private: bool = False) -> str:
-    """Check ``artifact``, upload it to the Hugging Face Hub as ``repo`` ("owner/name"), and return its address."""
-    if not HUB_ID.fullmatch(repo) or "@" in repo:
-        raise ValueError(f"{repo!r} is no name on the Hub: give owner/name")
-    model = read(artifact)
-    try:
-        address = model.push_to_hub(repo, private=private, commit_message=f"{model.run.method.name} by mvitac publish")
-    except Exception as error:  # offline, no login, no right to write: the client has an exception for each
-        raise ValueError(f"{artifact} is complete, but {repo} cannot be written on the Hub: {brief(error)}") from None
-    return str(address)

@@ -205,20 +205,24 @@ def source(text: str, modality: str) -> Source:
     return recording(text)
 
 
+def _place(text: str) -> tuple[Path, float]:
+    """Path and rate of a video or folder[@fps]."""
+    name, _, rate = text.rpartition("@")
+    return (Path(name), float(rate)) if name and Path(name).is_dir() else (Path(text), 30.0)
+
+
 def is_recording(text: str) -> bool:
     """Whether ``text`` names a video, or a folder[@fps] with images in it."""
-    folder = text.rpartition("@")[0]
-    path = Path(folder) if folder and Path(folder).is_dir() else Path(text)
+    path, _ = _place(text)
     images = path.is_dir() and any(file.suffix.lower() in IMAGES for file in path.iterdir())
     return images or path.suffix.lower() in VIDEOS
 
 
 def recording(text: str) -> Recording:
     """The video file or the folder[@fps] that ``text`` names; ValueError if there is none, or it cannot be read."""
-    name, at, rate = text.rpartition("@")
-    path, fps = (Path(name), float(rate)) if at and Path(name).is_dir() else (Path(text), 30.0)
+    path, fps = _place(text)
     if not 0 < fps < float("inf"):
-        raise ValueError(f"source {text!r}: {rate} is no frame rate")
+        raise ValueError(f"source {text!r}: {fps} is no frame rate")
     if not (path.is_dir() or path.suffix.lower() in VIDEOS):
         how = f"give a video ({', '.join(VIDEOS)}) or a folder[@fps]; live: or a camera or sim"
         raise ValueError(f"source {text!r}: {how}")

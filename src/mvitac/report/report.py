@@ -54,16 +54,12 @@ def write_report(
     elif result is None:
         with shown(quiet=quiet):
             result = _probe(runs, pack)
-    elif not isinstance(result, dict) or {"pack", "records", "retrieval", "summary", "classes"} - set(result):
-        raise ValueError("this is not a probe result: make one with `mvitac probe RUN... --json FILE`")
     elif result["pack"] != pack.digest:
-        raise ValueError(
-            "the probe result is about other data than these runs: make it again with `mvitac probe --json`"
-        )
+        raise ValueError("the probe result is about other data than these runs: probe them again")
     scored = {Path(r["run"]).resolve() for r in [*result["records"], *result["retrieval"]] if "run" in r}
     if scored and (other := scored ^ {run.path.resolve() for run in runs}):  # its means are of all of its runs
         names = ", ".join(map(str, sorted(other)))
-        raise ValueError(f"the probe result and the report differ in {names}: make it again with `mvitac probe --json`")
+        raise ValueError(f"the probe result and the report differ in {names}: probe them again")
     with shown(quiet=quiet):
         html = _page(Study(runs, pack, result, Path(out)))
     write_atomic(Path(out) / "report.html", lambda file: file.write(html.encode()))
@@ -92,7 +88,6 @@ def _page(study: Study) -> str:
     title = f"{', '.join(study.sources)} on {study.pack.spec.name}"
     sections = {
         "scores": ("Scores of the frozen features", score_sections.probe),
-        "sensor": ("A sensor it never saw", score_sections.new_sensor),
         "retrieval": ("Finding the other modality", evidence.retrieval),
         "loss": ("Loss", evidence.loss),
         "collapse": ("Learning or collapsing?", evidence.collapse),

@@ -65,22 +65,6 @@ def probe(study: Study) -> list[Markup]:
     return [html.paragraph(intro), html.grid(drawn), *numbers]
 
 
-def new_sensor(study: Study) -> list[Markup]:
-    """Scores on a sensor that was not trained on, of a demo."""
-    found = study.result.get("new sensor", {"summary": {}})
-    if not found["summary"]:
-        return []
-    cells = [cell for task in found["summary"].values() for cell in task["touch"].values()]
-    intro = (
-        f"Touches of {min(cell['groups'] for cell in cells)} unseen {found['group_by']}s with another gel, lights and"
-        " camera. Neither the encoder nor the probe saw this sensor. In known colours: unlabelled images of it tell how"
-        " it colours slope, so that its touches can be shown as the known sensors would show them, as mvitac probe"
-        " --standardise colours features does."
-    )
-    notes = [html.paragraph(f"{note}.") for note in found["notes"]]
-    return [html.paragraph(intro), *_scores(study, found["summary"]), *notes]
-
-
 def _scores(study: Study, summary: dict[str, Any]) -> list[Markup]:
     """A table of accuracies, one of R2, and one of each target."""
     parts = []
