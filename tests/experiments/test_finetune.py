@@ -19,13 +19,12 @@ from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
-from mvitac.evaluation import sensors
 from mvitac.evaluation.controls import imagenet_trunk
 from mvitac.evaluation.diagnostics import mean_error
 from mvitac.evaluation.evaluate import check_unseen
 from mvitac.evaluation.leaks import UNKNOWN
 from mvitac.evaluation.probe import probe_model
-from mvitac.experiments.adapt import COLOURED, NEW, OLD, TRANSFER, Adaptation, _old_packs, _scores, adapt
+from mvitac.experiments.adapt import NEW, OLD, Adaptation, adapt
 from mvitac.experiments.finetune import FROZEN, SCRATCH, Finetuning, _start, finetune
 from mvitac.model_files import load
 from mvitac.nn.encoders import EncoderConfig
@@ -289,8 +288,8 @@ def test_before_and_after_are_scored_on_new_and_old_data(
 ) -> None:
     result = adapted(ancestor, darker, tmp_path / "out", Adaptation(steps=1))
     cells = {(r["data"], r["task"], r["modality"], r["source"]) for r in result["records"]}
-    assert {d for d, *_ in cells} == {NEW, OLD, TRANSFER} and len(cells) == len(result["records"])
-    assert (NEW, "R@5", "touch -> vision", "after") in cells and (TRANSFER, "pattern", "both", "before") in cells
+    assert {d for d, *_ in cells} == {NEW, OLD} and len(cells) == len(result["records"])
+    assert (NEW, "R@5", "touch -> vision", "after") in cells
     before = {
         r["task"]: r for r in result["records"] if (r["data"], r["modality"], r["source"]) == (OLD, "both", "before")
     }
@@ -303,34 +302,6 @@ def test_a_run_in_bf16_adapts(pack: Pack, bare: Pack, tmp_path: Path) -> None:
     start = train(smoke(pack, eval_every=0, precision="bf16"), tmp_path / "start", quiet=True)
     adapted(start, bare, tmp_path / "out", Adaptation(steps=2, old=bare.path))
     assert all(bool(value.isfinite().all()) for value in weights(tmp_path / "out").values())
-
-
-def test_a_new_sensor_is_also_scored_in_known_colours(
-    ancestor: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """If its colours can be learned; without a new sensor nothing is said of it."""
-
-    class Other(Toy):
-        def read(self, item: int) -> Any:
-            (sample,) = super().read(item)
-            return [replace(sample, columns={**sample.columns, "sensor": "other"})]
-
-    other = build(Other(), tmp_path / "other", size=32, workers=1, quiet=True)
-    model, said = load(ancestor), []
-    assert _old_packs(model, pack.path, pack, said.append).keys() == {OLD, TRANSFER} and not said
-    assert _old_packs(model, pack.path, other, said.append).keys() == {OLD, TRANSFER}
-    assert len(said) == 1 and said[0].startswith(f"{COLOURED}: not scored (sensor 'other'")
-    monkeypatch.setattr(sensors, "learn_colours", lambda images: None)
-    monkeypatch.setattr(sensors, "recolour", lambda images, source, target: 255 - images)
-    both = _old_packs(model, pack.path, other, said.append)[COLOURED]
-    found = _scores(model, both, None, retrieval=False)
-    expected = probe_model(model, both, both.spec.tasks, ["touch", "both"], ["linear"], ("colours", "features"))
-    plain = probe_model(model, both, both.spec.tasks, ["touch", "both"], ["linear"])
-    correct = [
-        {(r["task"], r["modality"]): r["group_correct"] for r in records if r["modality"] != "vision"}
-        for records in (found, expected, plain)
-    ]
-    assert correct[0] == correct[1] != correct[2]
 
 
 @pytest.fixture(scope="module")

@@ -58,19 +58,8 @@ class Node:
             m: [Stream(f"{m} {i}", Topic(), clock=clock) for i in range(shape[2] // 3)]
             for m, shape in frame_shapes(engine).items()
         }
-        self.live = Live(
-            engine,
-            self.streams,
-            clock=clock,
-            tell=lambda event: warn(event.text),
-            nearest=self._keep,
-            always=always,
-            free=free,
-        )
-
-    def _keep(self, outputs: dict[str, np.ndarray]) -> list[str]:
-        self.embedding = np.concatenate([v[0] for name, v in outputs.items() if name.startswith("embedding_")])
-        return []
+        told: dict[str, Any] = {"tell": lambda event: warn(event.text), "always": always, "free": free}
+        self.live = Live(engine, self.streams, clock=clock, **told)
 
     def image(self, modality: str, which: int, message: Any) -> None:
         """Make ``message`` the newest of camera or sensor ``which`` of ``modality``."""
@@ -89,7 +78,8 @@ class Node:
             topic: Any = self.live.leading.origin
             stamp = topic.header.stamp
             said = {"stamp": {"sec": stamp.sec, "nanosec": stamp.nanosec}, **said}
-            self.publish(topic.header, said, self.embedding if self.live.answer else None)
+            parts = [x[0] for name, x in self.live.outputs.items() if name.startswith("embedding_")]
+            self.publish(topic.header, said, np.concatenate(parts) if self.live.answer else None)
 
 
 def main() -> None:

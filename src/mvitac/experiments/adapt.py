@@ -9,16 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
 from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.evaluate import check_unseen
 from mvitac.evaluation.features import fitting
 from mvitac.evaluation.leaks import Scored, Source, read_sources
 from mvitac.evaluation.probe import probe_model, scorable, split_rows
-from mvitac.evaluation.probe_config import Standardise
 from mvitac.evaluation.retrieval import cross_modal, retrieved_rows
-from mvitac.evaluation.sensors import RecolouredPack
 from mvitac.model import Model
 from mvitac.model_files import load
 from mvitac.nn.initial import Init
@@ -28,8 +25,7 @@ from mvitac.system.progress import shown, work
 from mvitac.training.loop import train
 from mvitac.training.setup import check_out
 
-NEW, OLD, TRANSFER = "new data", "old data", "probes of old labels on new data"
-COLOURED = f"{TRANSFER}, in the colours of old sensors"
+NEW, OLD = "new data", "old data"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +70,7 @@ def adapt(
     if lacking := [m for m in model.encoders if m not in pack.spec.modalities]:
         raise ValueError(f"{ancestor} was trained with {lacking[0]}, which the data lacks")
     fitting(model, pack)
-    packs = {NEW: pack} | _old_packs(model, asked.old, pack, say)
+    packs = {NEW: pack} | _old_pack(model, asked.old, say)
     sources = {  # refuses leaks before anything is trained
         name: check_unseen([ancestor], one, scorable(one), allow_leak=asked.allow_leak)[0]
         for name, one in packs.items()
@@ -85,7 +81,7 @@ def adapt(
         for name, one in packs.items():
             learned = read_sources(out)
             for source, scored, known in (("before", model, sources[name]), ("after", after, learned)):
-                found = _scores(scored, one, known, retrieval=name in (NEW, OLD))
+                found = _scores(scored, one, known)
                 records += [{"data": name, "source": source, "seed": asked.seed, **record} for record in found]
                 advance()
     result = {
@@ -107,39 +103,27 @@ def _run_of(model: Model, ancestor: Path, data: DatasetConfig, pack: Pack, asked
     return replace(run, steps=asked.steps, batch_size=size, seed=asked.seed, eval_every=0, checkpoint_every=0)
 
 
-def _old_packs(model: Model, given: Path | None, new: Pack, say: Callable[[str], object]) -> dict[str, Pack]:
-    """What the model was trained on, or the pack ``given``; and, joined with ``new``, probes that are learned on it.
-
-    They are also scored on new sensors in the colours of old ones, which needs no training: what adapting has to beat.
-    """
+def _old_pack(model: Model, given: Path | None, say: Callable[[str], object]) -> dict[str, Pack]:
+    """What the model was trained on, or the pack ``given``; {} if neither is there."""
+    if given:
+        return {OLD: Pack(given)}
     try:
-        old = Pack(given) if given else model.open_data(quiet=True)
+        return {OLD: model.open_data(quiet=True)}
     except ValueError as error:
-        if given:
-            raise
         say(f"what is forgotten is not scored: {brief(error)} (--old PACK names data of the old sensors)")
         return {}
-    found, other = {OLD: old}, set(new.sensor_names) - set(old.sensor_names)
-    for name, join in ((TRANSFER, JoinedPack), *([(COLOURED, RecolouredPack)] if other else [])):
-        try:
-            found |= {name: join(old, new)} if scorable(old) and scorable(new) else {}
-        except ValueError as error:
-            say(f"{name}: not scored ({error})")
-            break  # nor in other colours
-    return found
 
 
-def _scores(model: Model, pack: Pack, learned: Sequence[Source] | None, *, retrieval: bool) -> list[dict[str, Any]]:
+def _scores(model: Model, pack: Pack, learned: Sequence[Source] | None) -> list[dict[str, Any]]:
     """Records of linear probes of every task, and of retrieval between modalities: on test groups, or val without any."""
     tasks, scored = {task.name: task for task in scorable(pack)}, Scored(pack)
     modalities = [*pack.spec.modalities, *(["both"] if len(pack.spec.modalities) == 2 else [])]
     records: list[dict[str, Any]] = []
-    looks: tuple[Standardise, ...] = ("colours", "features") if isinstance(pack, RecolouredPack) else ()
-    for record in probe_model(model, pack, [*tasks.values()], modalities, ["linear"], looks) if tasks else ():
+    for record in probe_model(model, pack, [*tasks.values()], modalities, ["linear"]) if tasks else ():
         leak = scored.leak(learned, split_rows(pack, tasks[record["task"]]).test)
         records += [{**record, "leak": leak}] if record["probe"] == "linear" else []
     rows = retrieved_rows(pack)
     rows = rows if len(rows) else pack.rows("val", having=pack.spec.modalities)
-    for record in cross_modal(model, pack, rows) if retrieval and len(rows) else ():
+    for record in cross_modal(model, pack, rows) if len(rows) else ():
         records.append({**record, "task": "R@5", "modality": record["direction"], "leak": scored.leak(learned, rows)})
     return records

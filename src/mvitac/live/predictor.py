@@ -105,6 +105,8 @@ class Live:
         self.last: Touch | None = None
         self.answer: Touch | None = None
         """What the latest prediction says: the current touch, or a frame without contact (``always``)."""
+        self.outputs: dict[str, np.ndarray] = {}
+        """Of the engine, for the latest prediction."""
         self.contact: bool | None = None
         self._seen = -1
         self._judged: dict[str, int] = {}
@@ -179,7 +181,7 @@ class Live:
         elif self.touch is None:
             self.touch = self.answer = Touch(self.num_touches, now)
         assert self.answer
-        outputs = self.engine(**{m: image[None] for m, image in given.items()})
+        self.outputs = outputs = self.engine(**{m: image[None] for m, image in given.items()})
         self.answer.add(
             {task: outputs[f"probability_{task}"][0] for task in self.engine.classes},
             {task: outputs[f"value_{task}"][0] for task in self.engine.values},
