@@ -307,7 +307,6 @@ def test_the_cache_knows_another_tar_of_the_same_size(tmp_path: Path) -> None:
                 add(tar, f"{i:04d}.json", json.dumps({"split": "train" if i < 4 else "test"}).encode())
         os.utime(options.path, (when, when))
         packs.append(options.open(quiet=True))
-    assert len({pack.meta["fingerprint"]["file_sizes"] for pack in packs}) == 1
     assert [int(pack.images["touch"][0, 0, 0, 0]) for pack in packs] == [40, 200, 90]
 
 

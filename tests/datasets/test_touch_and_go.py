@@ -447,8 +447,8 @@ def test_label_txt_alone_serves_and_knows_no_official_split(tree: Path, tmp_path
 
 def test_from_the_download_to_a_trained_model(tree: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, run = tmp_path / "pack", tmp_path / "run"
-    choice = ["--data", "touch-and-go", "--data.root", str(tree), "--data.split", "official"]
-    assert main(["data", "pack", *choice, "--data.size", "32", "--out", str(out), "--quiet"]) == 0
+    choice = ["--data", "touch-and-go", "--root", str(tree), "--split", "official", "--size", "32"]
+    assert main(["data", "pack", *choice, "--out", str(out), "--quiet"]) == 0
     told = capsys.readouterr().out
     assert "239 samples at 32 px" in told and "note: official split: 7 of 7 test recordings are also in train" in told
     assert main(["data", "info", str(out)]) == 0

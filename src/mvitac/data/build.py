@@ -95,7 +95,7 @@ def _build(source: Source, out: Path, request: dict[str, Any], workers: int, max
         raise ValueError(f"dataset {spec.name!r} has no samples to pack")
     partial = _Partial(out.with_name(out.name + ".partial"), spec, num, request)
     disk = partial.check_disk()
-    _claim(partial.folder, request, source.sizes_at)
+    _claim(partial.folder, request)
     if not quiet:
         print(f"packing {num} samples at {size} px into {out}: {disk}")
     step = max(1, NUM_PART_ROWS * len(items) // max(len(items), num))
@@ -116,15 +116,15 @@ def _build(source: Source, out: Path, request: dict[str, Any], workers: int, max
     return Pack(out, verify=False)
 
 
-def _claim(partial: Path, request: dict[str, Any], sizes_at: str | None) -> None:
-    """Write the request of a new build, or check that an interrupted build was of the same request."""
+def _claim(partial: Path, request: dict[str, Any]) -> None:
+    """Write the request of a new build, or check that an interrupted build was of the same request.
+
+    Changed files are found part by part, by their stamps.
+    """
     if not (partial / "request.json").exists():
         write_json(partial / "request.json", request)
         return
     known = read_json(partial / "request.json", f"an unfinished pack's request (delete {partial})")
-    if sizes_at:  # changed files are found part by part, by their stamps
-        with contextlib.suppress(KeyError, TypeError):  # a request of another dataset
-            known["fingerprint"][sizes_at] = request["fingerprint"][sizes_at]
     if known != json.loads(json.dumps(request)):
         raise ValueError(f"{partial} is an unfinished pack of something else: delete it or choose another --out")
 

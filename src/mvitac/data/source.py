@@ -9,7 +9,7 @@ import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -59,9 +59,6 @@ def one_stamp(stamps: Iterable[Stamp]) -> int:
 class Source(ABC):
     """A dataset to read samples from. It must be picklable, because packing uses several processes."""
 
-    sizes_at: ClassVar[str | None] = None
-    """Key of file sizes in the fingerprint. A resumed build ignores it and compares stamps, part by part."""
-
     @abstractmethod
     def spec(self) -> DataSpec: ...
 
@@ -75,7 +72,7 @@ class Source(ABC):
 
     @abstractmethod
     def fingerprint(self) -> dict[str, Any]:
-        """Return JSON-ready values that determine the content: equal fingerprints and stamps give equal packs."""
+        """Return JSON-ready values that, with the stamps, determine the content: what is read and how, not when."""
 
     def stamps(self) -> Sequence[int] | None:
         """Return a number per item (``one_stamp``) that changes when one of its files does.

@@ -100,8 +100,6 @@ class Grasp:
 class Calandra(Source):
     """One item is one grasp, sorted by shard and number. Names and outcomes are read first, images by ``read``."""
 
-    sizes_at = "files"
-
     def __init__(self, config: CalandraConfig) -> None:
         self.config = config
         self._files = {file: stamp_of(str(file)) for file in find_shards(config.path, config.shards)}
@@ -129,7 +127,7 @@ class Calandra(Source):
         known = [[g.shard, g.index, g.object, g.gripping, bool(g.damage)] for g in self._grasps]
         return {
             "reader": f"calandra {VERSION}",
-            "files": {file.name: stamp[0] for file, stamp in self._files.items()},
+            "files": [file.name for file in self._files],
             "grasps": digest(known),
             "options": {k: v for k, v in to_json(self.config).items() if k not in ("path", *KEEPING)},
         }

@@ -88,16 +88,14 @@ def check_present(
     return missing
 
 
-def check_files(
-    table: Manifest, columns: Sequence[str], grounds: Sequence[Background]
-) -> tuple[list[int], dict[str, Stamp]]:
+def check_files(table: Manifest, columns: Sequence[str], grounds: Sequence[Background]) -> dict[str, Stamp]:
     """Check that every image file exists and is not empty, and that no row has one image in two ``columns``.
 
-    Returns the file size of each image of each row (for the fingerprint), and the stamp of each file by its path.
+    Returns the stamp of each file by its path.
     """
     stamps: dict[str, Stamp] = {}
     missing: list[str] = []
-    sizes: list[int] = []
+    num = 0
     for i, number in enumerate(table.numbers):
         named = [(column, ref) for column in columns if (ref := table.images[column][i])]
         if len({replace(ref, path=os.path.normpath(ref.path)) for _, ref in named}) < len(named):
@@ -107,11 +105,10 @@ def check_files(
             if ref.path not in stamps:
                 folder = type(ref) is not ImageRef and os.path.isdir(ref.path)  # zarr, a bag
                 stamps[ref.path] = folder_stamp(ref.path) if folder else stamp_of(ref.path)
-            sizes.append(stamps[ref.path][0])
-            if sizes[-1] <= 0:
-                name = table.rows[i].get(column) or os.path.basename(ref.path)
-                missing.append(f"row {number} {column} {name}{' (0 bytes)' if sizes[-1] == 0 else ''}")
+            num += 1
+            if stamps[ref.path][0] <= 0:
+                missing.append(f"row {number} {column} {table.rows[i].get(column) or os.path.basename(ref.path)}")
     if missing:
-        few = f"{len(missing)} of {len(sizes)} image files are missing or empty, e.g. {'; '.join(missing[:3])}"
+        few = f"{len(missing)} of {num} image files are missing or empty, e.g. {'; '.join(missing[:3])}"
         raise ValueError(f"{table.path}: {few} (paths are relative to {table.root})")
-    return sizes, stamps
+    return stamps

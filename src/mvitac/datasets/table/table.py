@@ -26,7 +26,6 @@ from mvitac.datasets.table.manifest import Manifest, number_of
 from mvitac.datasets.table.read_rows import Row, bundles, read_rows
 from mvitac.datasets.table.splits import BY_GROUP
 from mvitac.registry import check_range, to_json, unknown
-from mvitac.system.files import digest
 
 VERSION = 3  # version of this reader. Increase it when the same table would give another pack.
 CONTROL_NAMES = ("majority", "pixels", "border", "untrained", "imagenet", "start")
@@ -184,8 +183,6 @@ class RecordedConfig(RowsConfig, ABC):
 class Rows(Source):
     """Reads a table. An item is one row, or the rows of one video (one row group, ...), which are read in one pass."""
 
-    sizes_at = "file_sizes"
-
     def __init__(self, config: RowsConfig) -> None:
         self._config = config
         self._title = config.title or (config.path if config.path.is_dir() else config.path.parent).resolve().name
@@ -206,7 +203,7 @@ class Rows(Source):
         table, grounds = self._select(table)
         asked = {"vision": self._images[: bool(self._vision)], "touch": self._touch}
         missing = image_columns.check_present(table, asked, config.allow_missing)
-        self._sizes, stamps = image_columns.check_files(table, self._images, grounds)
+        stamps = image_columns.check_files(table, self._images, grounds)
 
         group_by, groups = self._grouping(table)
         touch_groups = table.filled(config.touch_group, "touch_group") if config.touch_group else groups
@@ -369,7 +366,6 @@ class Rows(Source):
             "reader": f"{self._config.name} {VERSION}",
             "title": self._title,
             "manifest": self._digest,
-            "file_sizes": digest(self._sizes),
             "options": {k: v for k, v in to_json(self._config).items() if k not in ("path", *KEEPING)},
         }
 

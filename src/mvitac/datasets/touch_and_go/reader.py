@@ -84,8 +84,6 @@ class TouchAndGoConfig(DatasetConfig):
 class TouchAndGo(Source):
     """One item is up to ``CHUNK`` frames of one recording, ascending, read in one forward pass of each video."""
 
-    sizes_at = "recordings"
-
     def __init__(self, config: TouchAndGoConfig) -> None:
         self._config, self._lists = config, config.lists or config.root
         if not self._lists.is_dir():
@@ -118,7 +116,7 @@ class TouchAndGo(Source):
             "reader": f"touch-and-go {VERSION}",
             "lists": {file.name: digest_file(file) for file in files},
             "options": {k: v for k, v in to_json(config).items() if k not in ("root", "lists", *KEEPING)},
-            "recordings": digest([recording.state() for recording in found]),
+            "recordings": digest([[r.name, *(place.name for place in r.places.values())] for r in found]),
             "missing": dict(sorted(missing.items())),
         }
 

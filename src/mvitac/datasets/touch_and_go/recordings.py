@@ -3,12 +3,10 @@
 Each modality of a recording is an mp4 file or a folder of JPEGs named by frame number (the layout is in ``reader.py``).
 """
 
-import functools
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,21 +26,11 @@ class Recording:
     name: str
     places: dict[str, Path]
 
-    def state(self) -> list[Any]:
-        """Return the recording's files and the sizes of its videos, for the fingerprint."""
-        return [self.name, *([p.name, self._movies[p][0] if p.suffix else 0] for p in self.places.values())]
-
     def stamps(self, numbers: Sequence[int]) -> Iterator[Stamp]:
         """Yield the stamps of the files with frames ``numbers``."""
         for place in self.places.values():
-            if place.suffix:
-                yield self._movies[place]
-            else:
-                yield from (stamp_of(f"{place}/{number:010d}.jpg") for number in numbers)
-
-    @functools.cached_property
-    def _movies(self) -> dict[Path, Stamp]:
-        return {place: stamp_of(str(place)) for place in self.places.values() if place.suffix}
+            files = [str(place)] if place.suffix else [f"{place}/{number:010d}.jpg" for number in numbers]
+            yield from map(stamp_of, files)
 
 
 def find_recordings(
