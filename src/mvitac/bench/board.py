@@ -1,4 +1,4 @@
-"""The board: one static page that compares results of one suite. Tasks down, encoders across, controls first."""
+"""The board: one static page that compares results of one suite."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,17 +7,22 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import matplotlib
+import numpy as np
 from markupsafe import Markup
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
 
 from mvitac.bench.result import GUESS, pinned_of, problems, read_result, records_of, suite_of
 from mvitac.bench.suite import SuiteTask
 from mvitac.evaluation import few_labels
 from mvitac.evaluation.intervals import paired_difference
-from mvitac.evaluation.leaks import UNKNOWN
+from mvitac.evaluation.leaks import UNKNOWN, leak_mark
 from mvitac.evaluation.score_text import percent, score_name, tested_on, with_interval
 from mvitac.evaluation.scores import by_cell, summarise
-from mvitac.report.figures import bars, to_svg
+from mvitac.report.figures import STYLE, new_figure, to_svg
 from mvitac.report.html import blocks as page
+from mvitac.report.palette import COLOURS
 from mvitac.report.tables import probe_name
 from mvitac.system.files import fields_of, write_atomic
 
@@ -152,6 +157,8 @@ def order_of(row: Row, names: Sequence[str]) -> str:
     return text + (f"; not ordered because of LEAK: {', '.join(left_out)}" if left_out else "")
 
 
+GLANCE = """Accuracy, or R2 of values, in percent. The shade rises from the untrained trunk to the best of its column. L:
+LEAK or LEAK?, see below. Encoders come first, by their mean rank; controls stand below the line."""
 SCORES = """Mean and 95 % interval over test groups (and seeds, where an encoder has several), in percent: accuracy, or R2
 of values. Encoders come first, by their mean rank, which is for reading only: the order of each task is below. An empty
 cell was not run."""
@@ -172,9 +179,10 @@ def _page(board: Board) -> str:
     head = page.head(suite.name, "mvitac bench", chips, suite.title)
     orders = [[f"{row.task}, {row.modality}", order_of(row, board.encoders)] for row in board.rows]
     few = [row for row in board.rows if row.few]
+    drawn = page.image(to_svg(_glance(board)), "scores of encoders and controls; the numbers are in the table")
     sections = [
+        ("glance", "At a glance", [page.paragraph(" ".join(GLANCE.split())), page.grid([page.figure(drawn)], "wide")]),
         ("scores", "Scores", _scores(board)),
-        ("bars", "Bars", [page.grid([_bars(board, row) for row in board.rows])]),
         *([("labels", "Few labels", _few(board, few))] if few else []),
         ("order", "Order", _text_table(ORDER, ["", "from best to worst"], orders)),
         ("encoders", "Encoders and leaks", _encoders(board)),
@@ -230,12 +238,27 @@ def _leaks(result: dict[str, Any]) -> str:
     return ". ".join([*found, *(["LEAK? not known"] if UNKNOWN in marks else [])]) or "none found"
 
 
-def _bars(board: Board, row: Row) -> Markup:
-    shown = [*board.encoders, *(name for name in board.controls[::-1] if name in CONTROLS and name != GUESS)]
-    cells = {name: row.cells[name] for name in shown if name in row.cells}
-    lines = {name: row.cells[name]["mean"] for name in board.controls if name in row.cells.keys() - cells.keys()}
-    drawn = bars(row.task, {row.modality: cells}, lines, f"{row.score} %")
-    return page.figure(page.image(to_svg(drawn), f"{row.task}, {row.modality}; the numbers are in the table"))
+@matplotlib.rc_context(STYLE)
+def _glance(board: Board) -> Figure:
+    """All scores as one picture. The shade of a column goes from its untrained row, or its lowest, to its best score."""
+    names, rows = [*board.encoders, *board.controls[::-1]], board.rows
+    scores = np.array([[row.cells[n]["mean"] if n in row.cells else np.nan for row in rows] for n in names])
+    least = [
+        row.cells.get("untrained", {"mean": low})["mean"] for row, low in zip(rows, np.nanmin(scores, 0), strict=True)
+    ]
+    shades = np.clip((scores - least) / np.maximum(np.nanmax(scores, 0) - least, 1e-9), 0, 1)
+    figure, axes = new_figure("", 2.2 + 0.3 * len(names), 3 + 0.6 * len(rows))
+    axes.imshow(shades, cmap=LinearSegmentedColormap.from_list("", ["white", COLOURS["blue"]]), aspect="auto", vmax=1.6)
+    for (line, column), score in np.ndenumerate(scores):
+        if np.isfinite(score):
+            leak = leak_mark(rows[column].cells[names[line]].get("leak", ""))
+            axes.text(column, line, f"{round(100 * score)}{'L' * bool(leak)}", ha="center", va="center", fontsize=11)
+    axes.set_yticks(range(len(names)), names)
+    axes.set_xticks(range(len(rows)), [f"{r.task}, {r.modality}" for r in rows], rotation=50, ha="left")
+    axes.tick_params(labelsize=11, top=True, labeltop=True, bottom=False, labelbottom=False, length=0)
+    axes.axhline(len(board.encoders) - 0.5, color=COLOURS["ink"], linewidth=0.8)
+    axes.spines[:].set_visible(False)
+    return figure
 
 
 def _few(board: Board, rows: Sequence[Row]) -> list[Markup]:
