@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import json
 import os
 import pickle
 import re
@@ -394,13 +396,74 @@ def test_truncated_files(tmp_path: Path, keep: int, capsys: pytest.CaptureFixtur
     refused(path, {}, r"a\.h5 cannot be read as HDF5 \(.*\): is it complete", capsys)
 
 
+def claimed(name: str, **about: Any) -> Callable[[Path], object]:
+    """Change what a dataset of a replay buffer says of itself."""
+
+    def change(path: Path) -> None:
+        file = path / name / ".zarray"
+        file.write_text(json.dumps(json.loads(file.read_text()) | about))
+
+    return change
+
+
+ENDS, TO_20 = "meta/episode_ends", "data: meta/episode_ends does not rise to 20"
+ZARR: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no JSON": (lambda path: (path / "data/gel/.zarray").write_text("{"), "cannot be read as zarr .*double quotes"),
+    "unknown codec": (claimed("data/gel", compressor={"id": "nosuch"}), "cannot be read as zarr .*nosuch"),
+    "pickles": (claimed("data/gel", dtype="|O", filters=[{"id": "pickle"}]), "cannot be read as zarr .*pickle"),
+    "chunks of nothing": (claimed("data/gel", chunks=[0, 16, 16, 3]), "/data/gel row 0 cannot be read .*by zero"),
+    "no end of ends": (claimed(ENDS, shape=[10**12], chunks=[10**12]), TO_20),
+    "ends of floats": (claimed(ENDS, dtype="<f8"), TO_20),
+    "ends of ends": (claimed(ENDS, shape=[2, 1], chunks=[2, 1]), TO_20),
+    "a negative end": (lambda path: zarr.open_group(path)[ENDS].__setitem__(0, -8), TO_20),
+}
+
+
+@pytest.mark.parametrize("name", ZARR)
+def test_what_zarr_says_of_itself_is_not_believed(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.zarr"
+    buffer = zarr.open_group(path, mode="w", zarr_format=2)
+    content = {"data/camera": grays(*range(20)), "data/gel": grays(*range(20)), ENDS: np.array([8, 20])}
+    for dataset, value in content.items():
+        buffer.create_array(dataset, data=value, chunks=value.shape)
+    ZARR[name][0](path)
+    refused(path, {"values": "", "group": ""}, f"a.zarr.*{ZARR[name][1]}", capsys)
+
+
+def shaped(shape: tuple[int, ...], kind: str) -> bytes:
+    """A .npy file without its numbers."""
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": kind, "fortran_order": False, "shape": shape})
+    return file.getvalue()
+
+
+NPY: dict[str, tuple[bytes, str]] = {
+    "no end of pixels": (shaped((10**6, 10**6), "|u1"), "cannot be read as an array"),
+    "nothing": (shaped((0, 0, 3), "|u1"), "has 0 pixels"),
+    "text": (shaped((1, 1), "<U1") + b"a\0\0\0", r"is <U1 \[1, 1\]: give numbers"),
+    "complex": (shaped((1, 1), "<c8") + bytes(8), r"is complex64 \[1, 1\]: give numbers"),
+    "objects": (shaped((1, 1), "|O") + pickle.dumps([1]), "cannot be read as an array"),
+}
+
+
+@pytest.mark.parametrize("name", NPY)
+def test_npy_files_that_are_no_images(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for i in range(12):
+        np.save(tmp_path / f"{i}.npy", grays(i)[0])
+    (tmp_path / "3.npy").write_bytes(NPY[name][0])
+    (tmp_path / "m.csv").write_text("camera,gel\n" + "\n".join(f"{i}.npy,{(i + 1) % 12}.npy" for i in range(12)))
+    refused(tmp_path / "m.csv", {"values": "", "group": ""}, rf"3\.npy {NPY[name][1]}", capsys)
+
+
 def refused(path: Path, options: dict[str, str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Check that packing ends with exit code 2, one line and nothing on disk."""
+    """Check that packing ends with exit code 2, one line and no pack."""
     out = path.parent / "out"
     given = {"vision": "camera", "touch": "gel", "values": "force_n:N", "group": "object"} | options
-    words = [word for name, value in given.items() for word in (f"--{name}", value)]
+    words = [word for name, value in given.items() if value for word in (f"--{name}", value)]
     assert main(["data", "pack", "--data", "folder", "--path", str(path), "--out", str(out), *words]) == 2
     error = capsys.readouterr().err
     assert error.startswith("mvitac: error: ") and error.count("\n") == 1
     assert re.search(says, error), error
-    assert not list(path.parent.glob("out*"))
+    assert not out.exists()

@@ -8,7 +8,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import simplejpeg
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 
 def fit(image: np.ndarray, size: int) -> np.ndarray:
@@ -57,6 +57,8 @@ def decode(path: str | Path | BinaryIO, name: str = "", span: Sequence[float] = 
             return to_rgb(image, span)
     except FileNotFoundError:
         raise ValueError(f"{name} does not exist: an image is missing there") from None
+    except UnidentifiedImageError:
+        raise ValueError(f"{name} cannot be read as an image (its content is none of {', '.join(FORMATS)})") from None
     # PIL has no common base class for errors of damaged files.
     except (OSError, ValueError, SyntaxError, TypeError, IndexError, EOFError, struct.error) as error:
         raise ValueError(f"{name} cannot be read as an image ({' '.join(str(error).split())})") from None

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import pyarrow as pa
@@ -19,7 +18,7 @@ import pyarrow.parquet as pq
 from PIL import Image
 
 from mvitac.data import video
-from mvitac.data.images import decode, to_gray
+from mvitac.data.images import MAX_PIXELS, decode, to_gray
 from mvitac.system.files import brief
 
 ARRAYS = (".h5", ".hdf5", ".zarr", ".zarr.zip")
@@ -60,7 +59,12 @@ class ImageRef:
 
         References of one container are asked for in ascending order. ValueError or OSError if it is damaged.
         """
-        return np.load(self.path, allow_pickle=False) if self.path.lower().endswith(".npy") else self.path
+        if not self.path.lower().endswith(".npy"):
+            return self.path
+        try:  # memory-mapped: a header may claim any shape
+            return np.load(self.path, mmap_mode="r", allow_pickle=False)
+        except ValueError as error:
+            raise ValueError(f"{self} cannot be read as an array ({brief(error)})") from None
 
     @staticmethod
     def read(refs: "Sequence[ImageRef]", lost: Damage) -> "Iterator[tuple[ImageRef, Image.Image]]":
@@ -159,8 +163,10 @@ def picture(found: str | bytes | np.ndarray, ref: ImageRef) -> Image.Image:
     if not isinstance(found, np.ndarray):
         return decode(found if isinstance(found, str) else io.BytesIO(found), str(ref), ref.span)
     pixels = found
-    if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (1,), (2,), (3,)):
-        raise ValueError(f"{ref} has the shape {list(pixels.shape)}: give height, width and 1 to 3 channels")
+    if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (1,), (2,), (3,)) or pixels.dtype.kind not in "biuf":
+        raise ValueError(f"{ref} is {pixels.dtype} {list(pixels.shape)}: give numbers [height, width, 1 to 3 channels]")
+    if not 0 < (num := pixels.shape[0] * pixels.shape[1]) <= MAX_PIXELS:
+        raise ValueError(f"{ref} has {num:,} pixels: 1 to {MAX_PIXELS:,} are read")
     if pixels.dtype != np.uint8 or ref.span:
         pixels = to_gray(pixels, ref.span or _usual(pixels.dtype), bool(ref.span))
     pixels = pixels.reshape(*pixels.shape[:2], -1)
@@ -191,7 +197,9 @@ def open_arrays(path: str | Path) -> Iterator[Any]:
                 yield zarr.open_group(store, mode="r")
     except ModuleNotFoundError:
         raise ValueError(f"{path} needs zarr: pip install 'mvitac[zarr]'") from None
-    except (OSError, KeyError, RuntimeError, TypeError, UnicodeDecodeError, BadZipFile) as error:
+    except Exception as error:  # zarr and its codecs raise any type for metadata that somebody wrote by hand
+        if isinstance(error, ValueError) and str(path) in str(error):
+            raise
         what = "HDF5" if hdf5 else "zarr"
         raise ValueError(f"{path} cannot be read as {what} ({brief(error)}): is it complete, and closed?") from None
 
@@ -217,7 +225,7 @@ class ArrayRow(ImageRef):
     def stored(self, container: Any) -> bytes | np.ndarray:
         try:
             return entry(container, self.index)
-        except (OSError, RuntimeError, IndexError) as error:
+        except (ArithmeticError, OSError, RuntimeError, IndexError, TypeError, ValueError) as error:
             raise ValueError(f"{self} cannot be read ({brief(error)})") from None
 
 
