@@ -19,7 +19,6 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.lerobot.reader import LeRobotConfig, choose
-from mvitac.datasets.table.clocks import nearest
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.datasets.webdataset import WebDatasetConfig
 from support.videos import film, shade
@@ -153,15 +152,6 @@ def test_lerobot_takes_no_frame_of_another_episode(tmp_path: Path) -> None:
     pq.write_table(pa.Table.from_pylist(episodes), file)
     with pytest.raises(ValueError, match=r"no frame within 0\.04 s of 1\.100 s \(episode 0, the nearest is 0\.100 s"):
         LeRobotConfig(path=root, size=16, labels=("kind",)).source()
-
-
-def test_nearest_of_two_rates() -> None:
-    times, wanted = np.arange(10) / 15, np.arange(20) / 30 + 0.01
-    at, away = nearest(times, wanted)
-    brute = np.abs(times[None] - wanted[:, None])
-    assert np.allclose(away, brute.min(1))
-    assert np.allclose(brute[np.arange(20), at], brute.min(1))
-    assert nearest(np.array([2.0]), np.array([1.0, 5.0]))[1].tolist() == [1.0, 3.0]
 
 
 def test_cameras_are_chosen_or_guessed() -> None:

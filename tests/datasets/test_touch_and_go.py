@@ -19,7 +19,6 @@ from mvitac.bench.suite import find_suite, open_set
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
-from mvitac.data.source import Sample
 from mvitac.data.video import frames
 from mvitac.datasets.table.splits import stratify
 from mvitac.datasets.touch_and_go.lists import (
@@ -32,7 +31,7 @@ from mvitac.datasets.touch_and_go.lists import (
     read_list,
     read_lists,
 )
-from mvitac.datasets.touch_and_go.reader import CHUNK, TouchAndGoConfig, _columns, _spec
+from mvitac.datasets.touch_and_go.reader import TouchAndGoConfig, _columns, _spec
 from mvitac.evaluation.leaks import Scored, source_of
 from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.retrieval import retrieved_rows
@@ -252,15 +251,6 @@ def test_a_video_is_preferred(tree: Path, tmp_path: Path) -> None:
     assert before.fingerprint() != after.fingerprint()
 
 
-def test_a_recording_is_read_in_bounded_pieces(tree: Path, tmp_path: Path) -> None:
-    (tmp_path / "dataset").symlink_to(tree / "dataset")
-    (tmp_path / "label.txt").write_text("\n".join(f"{n}/{i:010d}.jpg,{i % 3}" for n in NAMES[:2] for i in range(160)))
-    source = TouchAndGoConfig(root=tmp_path, size=32).source()
-    assert sum(source.samples_per_item()) == 320 and len(source.items()) == 2
-    assert all(sample.touch.nbytes == 32 * 32 * 3 for sample in source.read(0))  # type: ignore[union-attr]
-    assert CHUNK * 2 * 256 * 256 * 3 < 128e6
-
-
 def test_two_workers_give_the_pack_of_one(official: Pack, tree: Path, tmp_path: Path) -> None:
     assert packed(tree, tmp_path / "two", split="official", workers=2).digest == official.digest
 
@@ -352,14 +342,6 @@ def test_the_cache_knows_changed_jpegs(tmp_path: Path) -> None:
         packs.append(config.open(quiet=True))
     assert [(pack.num, int(pack.images["touch"][0, 0, 0, 0])) for pack in packs] == [(12, 40), (12, 200)]
     assert packs[0].meta["fingerprint"] == packs[1].meta["fingerprint"]
-
-
-@pytest.mark.parametrize("jpegs", [False, True])
-def test_a_sample_says_how_large_its_images_were(tmp_path: Path, jpegs: bool) -> None:
-    source = TouchAndGoConfig(root=write_tree(tmp_path, jpegs=jpegs), size=32).source()
-    sample = source.read(0)[0]
-    assert isinstance(sample, Sample) and sample.touch is not None and sample.touch.shape == (32, 32, 3)
-    assert sample.sizes == {"vision": (120, 160), "touch": (120, 160)}
 
 
 # -- what is missing or damaged ---------------------------------------------------------------------------------------

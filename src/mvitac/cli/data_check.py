@@ -10,7 +10,7 @@ from tabulate import tabulate
 from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, parse, printed_to, save_json, selectors
-from mvitac.data.checks.examine import Draw, examine_open, examine_pack, examine_source
+from mvitac.data.checks.examine import Draw, examine_pack, examine_source
 from mvitac.data.checks.finding import Finding, exit_code
 from mvitac.data.pack import Pack
 from mvitac.datasets.base import DatasetConfig, dataset
@@ -58,9 +58,8 @@ def check(argv: list[str]) -> int:
         options = parse(_PackOptions, rest, "data check", description=_MANUAL)
         name = " + ".join(options.pack)
         draw_sheet = _sheet(name, options)
-        if len(options.pack) == 1:
-            return _report(name, examine_pack(name, draw=draw_sheet), options)
-        return _report(name, examine_open(open_packs(options.pack), draw=draw_sheet), options)
+        pack = name if len(options.pack) == 1 else open_packs(options.pack)
+        return _report(name, examine_pack(pack, draw=draw_sheet), options)
     name = f"--data {chosen['--data']}"
     usual = _SourceOptions(data=dataset(chosen["--data"]))
     options = parse(_SourceOptions, rest, f"data check {name}", default=usual, description=_MANUAL)

@@ -16,16 +16,20 @@ PHASES = ("before", "during", "after")  # values of column phase: the moments of
 
 
 @dataclass(frozen=True, kw_only=True)
-class Task:
-    """A classification task for linear probes."""
-
+class _About:
     name: str
-    classes: tuple[str, ...]
-    """Class names, indexed by label. The label column is ``label_<name>``; -1 = unlabelled."""
     only: dict[str, str] = field(default_factory=dict)
     """Column -> value that a row must have to belong to the task, e.g. {"phase": "during"} for grasp success."""
     split: str = "split"
     """Column with the split of this task, if it differs from that of pre-training."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task(_About):
+    """A classification task for linear probes."""
+
+    classes: tuple[str, ...]
+    """Class names, indexed by label. The label column is ``label_<name>``; -1 = unlabelled."""
 
 
 def task_title(name: str, classes: Sequence[str]) -> str:
@@ -48,15 +52,10 @@ class Target:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ValueTask:
+class ValueTask(_About):
     """A regression task for probes: one number (a force) or several (the six numbers of a pose)."""
 
-    name: str
     targets: tuple[Target, ...]
-    only: dict[str, str] = field(default_factory=dict)
-    """Column -> value that a row must have to belong to the task, as for ``Task``."""
-    split: str = "split"
-    """Column with the split of this task."""
 
     def __post_init__(self) -> None:
         if not self.targets:

@@ -1,41 +1,22 @@
-"""``--data folder``: your own images, in a table, parquet, HDF5 or zarr files, videos or folders.
+"""``--data folder``: your own images, in a table, parquet, HDF5 or zarr files, videos or folders (docs/datasets.md).
 
-A **manifest** (.csv, .parquet or .jsonl) has one row per sample; its paths are relative to its own folder, or absolute:
-
-    vision,touch,material,object,split
-    vision/0001.jpg,touch/0001.jpg,wood,table_3,train
-
-A path may be a **video**; column ``frame`` (or ``touch_frame``, ``vision_frame``, ...) then holds the frame number, from
-0. Each video is decoded once, and is one group unless a column gives the groups.
-
-A **parquet file** may hold the images themselves (``mvitac.datasets.table.parquet``).
-
-**Class folders** need no manifest. Files are paired by their path inside the modality's folder, without the suffix:
+A **manifest** (.csv, .parquet or .jsonl) has one row per sample; its paths are relative to its own folder, or absolute.
+A path may be a **video**; column ``frame`` (or ``touch_frame``, ``vision_frame``, ...) then holds the frame number, from 0.
+Without a table, files are paired by their path inside the modality's folder, without the suffix:
 
     <root>/vision/<class>/<name>.jpg            <root>/touch/<class>/<name>.png          each file is its own group
     <root>/vision/<class>/<group>/<name>.jpg    ...                                      grouped by folder
     <root>/train/vision/<class>/...             <root>/test/vision/<class>/...           split by folder
-    <root>/left/<class>/...                     <root>/right/<class>/...                 two sensors instead of touch
     <root>/<class>/<name>.jpg                   one modality (see ``pictures``)
 
-**Recordings** need neither table nor labels. Two cameras of a recording are paired by time:
+and the cameras of a **recording** by time:
 
     <root>/<name>.mp4                           one camera (see ``pictures``), each video is a recording and a group
     <root>/<name>/gel.mp4  camera.mp4           two cameras: ``touch`` gel, ``vision`` camera
     <root>/touch/<name>.mp4  vision/<name>.mp4  the same by folders; vision, touch, left and right need no option
-    <root>/gel_timestamps.csv, .txt             the time of each frame of gel.mp4, if the container's is not right
     <root>/<number>.jpg                         one recording of one camera; a number of seconds since 1970 is its time
 
-An **HDF5 or zarr file** (.h5, .hdf5, .zarr, .zarr.zip), or a folder of them, has datasets with one row per frame
-(``mvitac.datasets.table.arrays``); ``vision`` and ``touch`` name image datasets:
-
-    buffer.zarr  data/camera  data/gel  data/action  meta/episode_ends       a replay buffer; also .zarr.zip
-    grips.h5     camera uint8 [N, H, W, 3]    gel uint8 [N, H, W, 3]    force_n [N]    pose [N, 6]    object [N]
-    demos.h5     data/demo_0/obs/camera       data/demo_0/obs/gel       data/demo_0/force             one group each
-
-Class folders are equivalent to a manifest with columns vision, touch (or left, right), label, group and, if there are
-split folders, split. A manifest is checked completely before the first image is decoded. Rows are counted from 1, without
-the header.
+A manifest is checked completely before the first image is decoded. Rows are counted from 1, without the header.
 """
 
 from dataclasses import dataclass

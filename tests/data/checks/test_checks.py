@@ -20,7 +20,7 @@ from mvitac.data.checks.examine import examine, examine_pack, examine_source
 from mvitac.data.checks.finding import Finding, exit_code
 from mvitac.data.checks.image_checks import MAX_LAG, motion_correlations
 from mvitac.data.checks.image_stats import look_at
-from mvitac.data.checks.name_checks import similar_names
+from mvitac.data.checks.table_checks import similar_names
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Task

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mvitac.data.build import build
-from mvitac.data.checks import duplicates, image_checks, name_checks, table_checks, value_checks
+from mvitac.data.checks import duplicates, image_checks, table_checks, value_checks
 from mvitac.data.checks.finding import Finding, judged
 from mvitac.data.checks.image_stats import look_at
 from mvitac.data.pack import Pack
@@ -80,7 +80,7 @@ def examine(pack: Pack, *, part: bool = False, window: Window = SINGLE) -> list[
         *labels,
         *table_checks.ungrouped(pack),
         *table_checks.leaks(pack),
-        name_checks.similar_names(pack),
+        table_checks.similar_names(pack),
         duplicates.exact_copies(pack, looks),
         duplicates.near_copies(pack, looks),
         table_checks.give_aways(pack),
@@ -88,19 +88,15 @@ def examine(pack: Pack, *, part: bool = False, window: Window = SINGLE) -> list[
     ]
 
 
-def examine_pack(path: str | Path, window: Window = SINGLE, draw: Draw | None = None) -> list[Finding]:
-    """Check the pack at ``path``."""
-    try:
-        pack = Pack(path)
-    except ValueError as error:
-        if not (Path(path) / "pack.json").is_file():
-            raise
-        return [judged("pack", str(error), "make it again; training refuses it, too", broken=True)]
-    return examine_open(pack, window, draw)
-
-
-def examine_open(pack: Pack, window: Window = SINGLE, draw: Draw | None = None) -> list[Finding]:
-    """As ``examine_pack``, for a pack that is open."""
+def examine_pack(pack: str | Path | Pack, window: Window = SINGLE, draw: Draw | None = None) -> list[Finding]:
+    """Check a pack, or the one at this path."""
+    if not isinstance(pack, Pack):
+        try:
+            pack = Pack(path := Path(pack))
+        except ValueError as error:
+            if not (path / "pack.json").is_file():
+                raise
+            return [judged("pack", str(error), "make it again; training refuses it, too", broken=True)]
     findings = [Finding("pack", "ok", f"{pack.num} rows, every digest matches"), *examine(pack, window=window)]
     if draw:
         draw(pack, findings)
