@@ -91,8 +91,9 @@ def examine(pack: Pack, *, part: bool = False, window: Window = SINGLE) -> list[
 def examine_pack(pack: str | Path | Pack, window: Window = SINGLE, draw: Draw | None = None) -> list[Finding]:
     """Check a pack, or the one at this path."""
     if not isinstance(pack, Pack):
+        path = Path(pack)
         try:
-            pack = Pack(path := Path(pack))
+            pack = Pack(path)
         except ValueError as error:
             if not (path / "pack.json").is_file():
                 raise
