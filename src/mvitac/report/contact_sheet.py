@@ -5,8 +5,6 @@ Check that camera and touch belong together, labels are right, colours look natu
 
 import textwrap
 from collections.abc import Sequence
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -151,13 +149,5 @@ def _text(text: str, width: int, size: int) -> Image.Image:
     lines = textwrap.wrap(text, max(1, int(width / (0.6 * size))))
     picture = Image.new("RGB", (width, (size + 5) * len(lines)), "white")
     for number, line in enumerate(lines):
-        ImageDraw.Draw(picture).text((0, number * (size + 5)), line, "#1d232b", _font(size))
+        ImageDraw.Draw(picture).text((0, number * (size + 5)), line, "#1d232b", ImageFont.load_default(size))
     return picture
-
-
-@cache
-def _font(size: int) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans, which comes with matplotlib."""
-    import matplotlib  # imported here: it is slow, and few commands draw
-
-    return ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", size)
