@@ -83,13 +83,10 @@ def _build(config: Any, argv: list[str], prog: str) -> None:
 
 def _groups(pack: Pack) -> str:
     """What a group of the pack is and what that does to splits and intervals."""
-    by, sizes = pack.spec.group_by, list(Counter(pack.column("group").tolist()).values())
-    few, many = min(sizes), max(sizes)
-    rows = f"{few} row{'s' * (few > 1)}" if few == many else f"{few} to {many} rows"
-    text = (
-        f"groups: {len(sizes)}, one per {by}, of {rows} each. A split takes whole groups, and intervals resample them"
-    )
-    return f"{text}."
+    sizes = Counter(pack.column("group").tolist()).values()
+    rows = " to ".join(map(str, dict.fromkeys((min(sizes), max(sizes)))))
+    about = f"groups: {len(sizes)}, one per {pack.spec.group_by}, of {rows} row{'s' * (rows != '1')} each"
+    return f"{about}. A split takes whole groups, and intervals resample them."
 
 
 @dataclass(frozen=True)
