@@ -120,7 +120,6 @@ def records_of(block: dict[str, Any], encoder: dict[str, Any]) -> list[dict[str,
 
 
 def _scores(record: dict[str, Any]) -> dict[str, Any]:
-    """The scores that the sums of a record give."""
     sums = record["sums"]
     if "targets" not in record:
         accuracy = sum(sums["correct"]) / sum(sums["n"])

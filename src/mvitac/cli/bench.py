@@ -34,21 +34,23 @@ class _Options:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _BoardOptions:
-    """Write one page that compares results of one suite: tasks down, encoders across, controls first."""
-
-    files: Positional[tuple[Path, ...]]
-    """Results that `mvitac bench MODEL` wrote."""
-    out: Path = Path("board.html")
-    """The page, one file without scripts."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class _CheckOptions:
     """Check results: digests, the suite inside, no score missing, sums per test group that predictions can give."""
 
     files: Positional[tuple[Path, ...]]
     """Results that `mvitac bench MODEL` wrote."""
+
+    def __post_init__(self) -> None:
+        if not self.files:
+            raise ValueError("name the results: files that `mvitac bench MODEL` wrote")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _BoardOptions(_CheckOptions):
+    """Write one page that compares results of one suite: tasks down, encoders across, controls first."""
+
+    out: Path = Path("board.html")
+    """The page, one file without scripts."""
 
 
 _MANUAL = """Score an encoder on every task of a suite, beside the same controls, and write one JSON file about it.
@@ -87,8 +89,6 @@ def bench(argv: list[str]) -> None:
 def board(argv: list[str]) -> None:
     """mvitac bench board FILE... [--out FILE.html]"""
     options = parse(_BoardOptions, argv, "bench board")
-    if not options.files:
-        raise ValueError("name the results to compare (see mvitac bench board --help)")
     check_place(options.out)
     write = loop.write_page if loop.is_result(options.files[0]) else write_board
     print(f"written: {write(options.files, options.out)}")
@@ -97,8 +97,6 @@ def board(argv: list[str]) -> None:
 def check(argv: list[str]) -> None:
     """mvitac bench check FILE..."""
     options = parse(_CheckOptions, argv, "bench check")
-    if not options.files:
-        raise ValueError("name the results to check (see mvitac bench check --help)")
     for path in options.files:
         if loop.is_result(path):
             _, value = loop.read_control(path)

@@ -98,7 +98,6 @@ def compare(argv: list[str]) -> None:
 
 
 def _parse(chosen: dict[str, str], rest: list[str], plan: Plan) -> _Options:
-    """The options, with the plan's own values as defaults."""
     if chosen.get("--recipe", plan.recipe) not in RECIPES:
         raise unknown("recipe", chosen.get("--recipe", plan.recipe), RECIPES)
     data = dataset(chosen["--data"]) if "--data" in chosen else plan.data
@@ -113,7 +112,6 @@ def _parse(chosen: dict[str, str], rest: list[str], plan: Plan) -> _Options:
 
 
 def _changed(plan: Plan, recipe: str, options: _Options) -> Plan:
-    """``plan`` as the options change it."""
     same = {name: getattr(options, name) for name in ("data", *_SAME)}
     changes = {**plan.set, **dict(setting(text) for text in options.set)}
     return replace(plan.only(options.rows), recipe=recipe, set=changes, **same)

@@ -60,7 +60,6 @@ def pack(argv: list[str]) -> None:
 
 
 def _build(config: Any, argv: list[str], prog: str) -> None:
-    """Build a pack of ``config``, whose fields are the options."""
     usual = _BuildOptions(out=tyro.MISSING, data=config)
     options = parse(_BuildOptions, argv, prog, default=usual, description=type(config).__doc__ or "")
     check_place(options.out)
@@ -128,7 +127,6 @@ def info(argv: list[str]) -> None:
 
 
 def _describe(pack: Pack) -> dict[str, Any]:
-    """What ``info`` prints of a pack, JSON-ready."""
     splits = {}
     for split in SPLITS:
         if len(rows := pack.rows(split)):

@@ -89,7 +89,6 @@ def _sheet(what: str, options: _Options) -> Draw | None:
 
 
 def _report(what: str, findings: Sequence[Finding], options: _Options) -> int:
-    """Print the findings, write the files that ``options`` name, and return the exit code."""
     code = exit_code(findings)
     rows = [[f.verdict, f.item, f.evidence + (f"\n-> {f.advice}" if f.advice else "")] for f in findings]
     table = tabulate(rows, ["", "item", "what was found"], disable_numparse=True, maxcolwidths=[None, 20, 80])

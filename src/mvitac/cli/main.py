@@ -80,7 +80,6 @@ def _continued(arguments: list[str]) -> str:
 
 
 def _run(arguments: list[str]) -> int:
-    """Run the command that ``arguments`` name, and return its exit code."""
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(HELP, end="")
         return 0

@@ -32,8 +32,6 @@ Call = Callable[[list[np.ndarray]], list[np.ndarray]]
 
 @dataclass(frozen=True)
 class _Target:
-    """What export.json says of a value."""
-
     name: str
     unit: str
     edges: tuple[float, ...]

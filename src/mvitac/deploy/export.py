@@ -117,7 +117,6 @@ def silent() -> Iterator[None]:
 def _measure(
     model: Model, graph: ExportModule, path: Path, pack: Pack, rows: np.ndarray, config: ExportConfig
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The report on the written file, and the outputs of the trained model for ``rows``."""
     engine = "openvino" if config.precision == "bf16" else "auto"
     call = open_model(path, engine, config.precision, config.threads)
     with work("computing the outputs of the model", len(rows), "rows") as advance:

@@ -46,7 +46,6 @@ def fit_probes(model: Model, pack: Pack) -> dict[str, LinearProbe]:
 
 
 def _fit_all(model: Model, pack: Pack) -> list[tuple[LinearProbe, dict[str, Any]]]:
-    """Every linear probe with its record (``evaluation.scores``), by task."""
     modalities = [m for m in pack.spec.modalities if m in model.encoders]
     tasks = {m: scorable(pack, m) for m in (*modalities, *(["both"] if len(modalities) == 2 else []))}
     records: Records = []
@@ -189,7 +188,6 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
 
 
 def _describe(model: Model, pack: Pack) -> dict[str, Any]:
-    """artifact.json, without its scores."""
     keys = ("name", "licence", "source")
     infos = [r.info for r in model.probes.values()]
     return {

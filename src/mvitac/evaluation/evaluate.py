@@ -171,7 +171,6 @@ def _score(
     others: Sequence[Bound],
     tasks: Sequence[AnyTask],
 ) -> tuple[Records, Records]:
-    """Probe and retrieval records of the runs, of other people's encoders, and of the controls."""
     records, retrieval = _probe_models(each, pack, tasks, modalities, session)
     records += probe_encoders(others, tasks, modalities, session.kinds, controls=session.controls)
     if not session.controls:
@@ -209,7 +208,6 @@ def as_trained(model: Model, pack: Pack) -> Pack:
 
 
 def _common_pack(models: Sequence[Model], pack: Pack | None) -> Pack:
-    """``pack``, or the data that all of ``models`` were trained on."""
     if pack:
         return as_trained(models[0], pack) if models else pack
     packs = [model.open_data() for model in models]

@@ -181,7 +181,6 @@ def _most_used(pack: Pack) -> tuple[str, ...]:
 
 
 def _colours_of(pack: Pack, number: int, option: str) -> GelColours:
-    """The colours of a sensor of ``pack``, learned from unlabelled images."""
     try:
         return learn_colours(pack.images["touch"][unlabelled_rows(pack, number, NUM_IMAGES)])
     except ValueError as error:

@@ -119,7 +119,6 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
 
 
 def _scores(job: Job) -> tuple[Records, Records]:
-    """Probe and retrieval records of a finished job, named by its row."""
     scores = read_json(job.out / "scores.json", "a run's scores")
     records = scores["records"]
     method = job.run.method.name
@@ -128,7 +127,6 @@ def _scores(job: Job) -> tuple[Records, Records]:
 
 
 def _controls(work: Work, out: Path, session: ProbeConfig) -> tuple[Records, Records]:
-    """The controls of the reference row's runs, kept in controls.json."""
     if not session.controls:
         return [], []
     runs = [job.run for job in work.jobs if job.label == work.plan.reference] or [work.jobs[0].run]

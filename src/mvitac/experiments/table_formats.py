@@ -5,7 +5,7 @@ import io
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from mvitac.report.figures import bars, to_png
 from mvitac.report.tables import RETRIEVAL, probe_name, retrieval_rows
 from mvitac.system.files import write_atomic, write_json
 
+TARGETS = "every target, and its mean absolute error"
 VALUES = ("score", "target", "unit", "mae", "rmse")  # columns of the CSV if there are tasks with values
 
 
@@ -47,17 +48,23 @@ def figure(lines: Sequence[Line], task: str, score: str) -> Figure:
 
 def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
     """The whole comparison as Markdown: what was compared, the tables, retrieval and cost."""
-    plan, shown = plan_of(result), _any_printed(lines)
+    plan = plan_of(result)
     text = [f"# {plan.title or plan.name}"]
     for paragraph in _preface(result, plan, lines):
         text += ["", paragraph]
-    text += ["", *pipes(*_table(lines, plan.reference, shown))]
-    for task, each in target_lines(result).items():
-        rows = pipes(*_table(each, plan.reference, False, targets=True))
-        text += [f"**{task}**: every target, and its mean absolute error", "", *rows]
+    for task, heads, rows in _tables(result, lines):
+        text += [f"**{task}**: {TARGETS}"] * bool(task) + ["", *pipes(heads, rows)]
     if rows := retrieval_rows(result["retrieval"]):
         text += pipes(["retrieval", "", *(f"{name} %" for name in RETRIEVAL)], rows)
     return "\n".join([*text, *_cost(result)]).rstrip() + "\n"
+
+
+def _tables(result: dict[str, Any], lines: Sequence[Line]) -> Iterator[tuple[str, list[str], list[list[str]]]]:
+    """Task, heads and rows: of the table of all tasks (named ""), then of the targets of each task with values."""
+    reference = plan_of(result).reference
+    yield "", *_table(lines, reference, _any_printed(lines))
+    for task, each in target_lines(result).items():
+        yield task, *_table(each, reference, False, targets=True)
 
 
 def _any_printed(lines: Sequence[Line]) -> bool:
@@ -103,7 +110,6 @@ def _p(p: float) -> str:
 
 
 def _preface(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> list[str]:
-    """Paragraphs about data, budget, statistics, and everything that limits the comparison."""
     seeds = max((c["seeds"] for c in result["cost"]), default=0)
     scores = dict.fromkeys("R2" if "targets" in record else "accuracy" for record in result["records"])
     probes = " or ".join(dict.fromkeys(probe_name(plan.probes[0], score) for score in scores))
@@ -161,7 +167,6 @@ def _budget(result: dict[str, Any]) -> str:
 
 
 def _made(result: dict[str, Any]) -> str:
-    """Commits and devices of the runs, and the commit of the tables if it differs."""
     tables, *runs = (
         f"{commit[:12]}{'+' * commit.endswith('+')}" if commit else "unknown"  # +: with local changes
         for commit in (result["commit"], *result["run_commits"])
@@ -188,10 +193,8 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
     notes += [f"Note: {note}." for note in _notes(result)]
     notes.append(f"95 % intervals: {covered(result['group_by'], result['records'])}")
     notes += [f"LEAK: {result['leaks']}."] if result["leaks"] else []
-    tables = [_tabular(*_table(lines, plan.reference, _any_printed(lines)))]
-    for task, each in target_lines(result).items():
-        rows = _tabular(*_table(each, plan.reference, False, targets=True))
-        tables.append(f"% {task}: every target, and its mean absolute error\n{rows}")
+    each = _tables(result, lines)
+    tables = [f"% {task}: {TARGETS}\n" * bool(task) + _tabular(heads, rows) for task, heads, rows in each]
     return "\n".join([*(f"% {' '.join(note.split())}" for note in notes), "\n\n".join(tables)]) + "\n"
 
 

@@ -230,7 +230,6 @@ class Live:
         return [newest, *(np.concatenate(each, axis=2) for each in list(zip(*sensors, strict=True))[1:])]
 
     def _back(self, stream: Stream) -> list[float]:
-        """Seconds from each frame of a window to the newest."""
         window = self.engine.window or {}
         unit = 1.0 if window["order"] == "time" else stream.interval() or 0.0
         return [k * window["stride"] * unit for k in range(window["frames"])]

@@ -150,6 +150,5 @@ def _time(file: Recording) -> Callable[[], float]:
 
 
 def _nearer(file: Recording, time: float) -> bool:
-    """Whether the next frame of ``file`` is as near to ``time`` as the one that was read last."""
     after = file.times[file.number + 1 : file.number + 2]
     return bool(len(after) and abs(after[0] - time) <= abs(file.time - time))

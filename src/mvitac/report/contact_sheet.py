@@ -145,7 +145,6 @@ def _row(tiles: Sequence[Tile], cell: int, room: int) -> Image.Image:
 
 
 def _text(text: str, width: int, size: int) -> Image.Image:
-    """Text in lines of about ``width`` pixels, at ``size`` pixels."""
     lines = textwrap.wrap(text, max(1, int(width / (0.6 * size))))
     picture = Image.new("RGB", (width, (size + 5) * len(lines)), "white")
     for number, line in enumerate(lines):

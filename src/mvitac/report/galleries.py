@@ -133,7 +133,6 @@ def _query(study: Study, rows: np.ndarray, asked: str, searched: str, query: Que
 
 
 def _picture(study: Study, modality: str, row: int) -> tuple[Markup, str]:
-    """A pack row's image, and its class in the first task or its group."""
     pack, label = study.pack, study.labels(np.array([row]))[0]
     group = str(pack.column("group")[row])
     name = pack.spec.tasks[0].classes[label] if label >= 0 else group

@@ -66,7 +66,6 @@ def probe(study: Study) -> list[Markup]:
 
 
 def _scores(study: Study, summary: dict[str, Any]) -> list[Markup]:
-    """A table of accuracies, one of R2, and one of each target."""
     parts = []
     for score in ("accuracy", "R2"):
         tasks = {task: found for task, found in summary.items() if score_name(found) == score}
