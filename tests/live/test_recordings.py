@@ -164,3 +164,21 @@ def test_predict_command(
     for words, says in wrong.items():
         assert main([*command, *words]) == 2
         assert says in capsys.readouterr().err
+
+
+def test_a_crop_is_what_the_model_sees(engine: Engine, films: dict[str, Path], tmp_path: Path) -> None:
+    """Of frames and of the image without contact; one that is larger than the frames is no frame."""
+    part = (slice(30, 90), slice(40, 120))
+    folder = tmp_path / "cut"
+    folder.mkdir()
+    for number, image in frames(films["touch"], range(NUM)):
+        Image.fromarray(image[part]).save(folder / f"{number:03}.png")
+    free = [next(iter(frames(films["touch"], [0])))[1]]
+    tables = []
+    for text, background in ((f"{films['touch']}#40:30:80:60", free), (f"{folder}@25", [free[0][part]])):
+        files = {"vision": [recording(str(films["vision"]))], "touch": [recording(text)]}
+        tables.append(whole(Recordings(engine, files, free=background).tables()))
+    assert all(np.array_equal(values, tables[1][name]) for name, values in tables[0].items())
+    assert tables[0]["contact"].sum() == NUM - FREE
+    large = Recordings(engine, {**opened(films), "touch": [recording(f"{films['touch']}#100:0:80:60")]}, free=free[:0])
+    assert not list(large.tables())

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from mvitac.data.images import decode, ros_pixels
-from mvitac.deploy.engine import Engine, frame_shapes
-from mvitac.live.cameras import Source
+from mvitac.deploy.engine import Engine
+from mvitac.live.cameras import Source, crop_of
 from mvitac.live.predictor import Live
 from mvitac.live.streams import Stream
 
@@ -25,6 +25,9 @@ class Topic(Source):
 
     message: Any = None
     header: Any = None  # of the message that was read last
+
+    def __init__(self, text: str) -> None:
+        self.name, self.crop = crop_of(text)
 
     def open(self) -> None:
         pass
@@ -45,6 +48,7 @@ class Node:
     def __init__(
         self,
         engine: Engine,
+        topics: dict[str, list[str]],
         publish: Callable[[Any, dict[str, Any], np.ndarray | None], None],
         clock: Callable[[], float],
         warn: Callable[..., Any],
@@ -52,11 +56,12 @@ class Node:
         always: bool = False,
         free: Sequence[np.ndarray] = (),
     ) -> None:
-        """``clock`` is that of the headers, in seconds; ``always`` and ``free`` as of ``Live``."""
+        """``topics`` by modality; ``clock`` is that of the headers, in seconds; ``always`` and ``free`` as of ``Live``."""
         self.publish, self.clock, self.warn = publish, clock, warn
         self.streams = {
-            m: [Stream(f"{m} {i}", Topic(), clock=clock) for i in range(shape[2] // 3)]
-            for m, shape in frame_shapes(engine).items()
+            m: [Stream(f"{m} {i}", Topic(text), clock=clock) for i, text in enumerate(given)]
+            for m, given in topics.items()
+            if given
         }
         told: dict[str, Any] = {"tell": lambda event: warn(event.text), "always": always, "free": free}
         self.live = Live(engine, self.streams, clock=clock, **told)
@@ -96,10 +101,6 @@ def main() -> None:
 
     engine = Engine(parameter("export"))
     topics = {modality: parameter(modality).split() for modality in ("vision", "touch")}
-    for modality, given in topics.items():
-        takes = frame_shapes(engine).get(modality, (0, 0, 0))[2] // 3
-        if len(given) != takes:
-            raise SystemExit(f"the model needs {takes} {modality} topic(s), parameter {modality} has {len(given)}")
     predictions = ros.create_publisher(String, "~/prediction", 10)
     embeddings = ros.create_publisher(Image, "~/embedding", 10)
 
@@ -112,6 +113,7 @@ def main() -> None:
 
     node = Node(
         engine,
+        topics,
         publish,
         lambda: 1e-9 * ros.get_clock().now().nanoseconds,
         ros.get_logger().warning,
@@ -120,8 +122,9 @@ def main() -> None:
     )
     # Keep only the newest message: the usual sensor profile queues five and delivers the oldest first.
     newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-    for modality, given in topics.items():
-        for which, topic in enumerate(given):
+    for modality, streams in node.streams.items():
+        for which, stream in enumerate(streams):
+            topic = stream.origin.name  # type: ignore[attr-defined]
             kind = CompressedImage if topic.endswith("/compressed") else Image
             ros.create_subscription(kind, topic, lambda m, of=(modality, which): node.image(*of, m), newest)
     ros.create_timer(1 / parameter("rate", 30.0), node.tick)

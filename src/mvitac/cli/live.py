@@ -59,6 +59,7 @@ class _Options(_Common):
 
     A SOURCE is a camera (its number, /dev/videoN or serial:NAME; @WIDTHxHEIGHT and @FPS after it ask for that mode, e.g.
     serial:D20345@320x240@60), a video file, a folder of pictures[@FPS], or sim[:SEED]. Without any, all are simulated.
+    #x:y:width:height after it is the part that is used, where the data was packed with --crop.
     """
 
     sensor: str = ""
@@ -148,6 +149,7 @@ class _PredictOptions(_Common):
     classes with probabilities, values with spread (docs/live.md).
 
     A SOURCE is a video file, or a folder of images[@FPS]. Frames of several recordings are matched by time.
+    #x:y:width:height after it is the part that is used, where the data was packed with --crop.
     """
 
     source: Positional[str | None] = None

@@ -27,6 +27,7 @@ class Source(ABC):
     fps: float = 30.0  # nominal rate
     paced: bool = True  # whether ``read`` itself waits for the next frame
     captured: float | None = None  # when the newest frame was, by the stream's clock; None: when it was read
+    crop: tuple[int, ...] = ()  # left, top, width and height of the part that is used
     sensor: str = ""  # name of the touch sensor, as in column sensor of packs; "" = not known
 
     @abstractmethod
@@ -37,6 +38,16 @@ class Source(ABC):
 
     def close(self) -> None:  # noqa: B027 - most have nothing to close
         pass
+
+    def cropped(self, image: np.ndarray) -> np.ndarray:
+        """The part of [H, W, 3] that is used."""
+        if not self.crop:
+            return image
+        left, top, width, height = self.crop
+        part = image[top : top + height, left : left + width]
+        if part.shape[:2] != (height, width):
+            raise ValueError(f"crop {':'.join(map(str, self.crop))} is larger than {image.shape[1]} x {image.shape[0]}")
+        return part
 
 
 class Camera(Source):
@@ -188,21 +199,31 @@ class Simulated(Source):
 MODE = re.compile(r"(?P<which>.+?)(@(?P<width>\d+)x(?P<height>\d+))?(@(?P<fps>\d+(\.\d+)?))?")
 
 
+def crop_of(text: str) -> tuple[str, tuple[int, ...]]:
+    """A source's text without ``#x:y:width:height`` at its end, and these numbers; () = all of its images."""
+    found = re.fullmatch(r"(.*)#(\d+):(\d+):([1-9]\d*):([1-9]\d*)", text)
+    return (found[1], tuple(map(int, found.groups()[1:]))) if found else (text, ())
+
+
 def source(text: str, modality: str) -> Source:
     """The source that ``text`` names; ValueError if there is none, or its file cannot be read.
 
     A camera (``0``, ``/dev/video2``, ``serial:D20345``; ``@320x240@60`` after it requests that mode), a video file, a
-    folder[@fps], or ``sim``[:seed] of this modality.
+    folder[@fps], or ``sim``[:seed] of this modality; ``#x:y:width:height`` at the end crops its images.
     """
-    if text.partition(":")[0] == "sim":
-        return Simulated(modality, int(text.partition(":")[2] or 0))
+    text, crop = crop_of(text)
     mode = MODE.fullmatch(text)
-    if mode and (mode["which"].isdigit() or text.startswith(("/dev/", "serial:"))):
+    if text.partition(":")[0] == "sim":
+        found: Source = Simulated(modality, int(text.partition(":")[2] or 0))
+    elif mode and (mode["which"].isdigit() or text.startswith(("/dev/", "serial:"))):
         if importlib.util.find_spec("cv2") is None:
             raise ValueError(f"source {text!r} needs OpenCV: pip install -e '.[live]' in mvitac's clone")
         size = (int(mode["width"]), int(mode["height"])) if mode["width"] else None
-        return Camera(mode["which"].removeprefix("serial:"), size, float(mode["fps"]) if mode["fps"] else None)
-    return recording(text)
+        found = Camera(mode["which"].removeprefix("serial:"), size, float(mode["fps"]) if mode["fps"] else None)
+    else:
+        found = recording(text)
+    found.crop = crop
+    return found
 
 
 def _place(text: str) -> tuple[Path, float]:
@@ -213,13 +234,14 @@ def _place(text: str) -> tuple[Path, float]:
 
 def is_recording(text: str) -> bool:
     """Whether ``text`` names a video, or a folder[@fps] with images in it."""
-    path, _ = _place(text)
+    path, _ = _place(crop_of(text)[0])
     images = path.is_dir() and any(file.suffix.lower() in IMAGES for file in path.iterdir())
     return images or path.suffix.lower() in VIDEOS
 
 
 def recording(text: str) -> Recording:
     """The video file or the folder[@fps] that ``text`` names; ValueError if there is none, or it cannot be read."""
+    text, crop = crop_of(text)
     path, fps = _place(text)
     if not 0 < fps < float("inf"):
         raise ValueError(f"source {text!r}: {fps} is no frame rate")
@@ -227,6 +249,7 @@ def recording(text: str) -> Recording:
         how = f"give a video ({', '.join(VIDEOS)}) or a folder[@fps]; live: or a camera or sim"
         raise ValueError(f"source {text!r}: {how}")
     files = Folder(path, fps) if path.is_dir() else Video(path)
+    files.crop = crop
     try:  # now: unlike a camera, a missing file does not come back
         files.open()
     except OSError as error:

@@ -94,7 +94,7 @@ class Live:
         touch = streams.get("touch", ())
         if len(free) not in (0, len(touch)):
             raise ValueError(f"{len(free)} background(s) for {len(touch)} touch sensor(s): give one of each, or none")
-        pairs = zip_longest(touch, free)
+        pairs = zip_longest(touch, [s.origin.cropped(image) for s, image in zip(touch, free, strict=False)])
         self.contacts = {stream.name: Contact(config, side, image) for stream, image in pairs if stream}
         self.counts: Counter[str] = Counter()
         self._ages = np.zeros(NUM_AGES)

@@ -107,7 +107,7 @@ class Recordings:
         contact, file = self.live.contacts[stream.name], self.files[stream]
         while contact.background is None and file.number + 1 < len(file.times):
             with suppress(ValueError):  # a damaged frame
-                contact(file.read())
+                contact(file.cropped(file.read()))
         file.open()
         return contact.background is not None
 
@@ -132,7 +132,7 @@ class Recordings:
             for stream, file in self.files.items():
                 while file.number < 0 or (file.number < number if stream is leading else _nearer(file, time)):
                     with suppress(ValueError):  # a damaged frame
-                        stream.take(file.read())
+                        stream.take(file.cropped(file.read()))
             newest = {m: [stream.newest() for stream in several] for m, several in self.live.streams.items()}
             apart = [abs(f.time - time) if f else np.inf for several in newest.values() for f in several]
             found, given = leading.newest(), None

@@ -79,7 +79,7 @@ class Stream:
                     return
                 self.origin.open()
                 self._open, self._opened_at = True, self.clock()
-            image = self.origin.read()
+            image = self.origin.cropped(self.origin.read())
         except Ended:
             self.ended = True
             self._say("ended", "has no more frames")
