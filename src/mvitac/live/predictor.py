@@ -49,6 +49,14 @@ class Touch:
         return classes[int(mean.argmax())], float(mean.max())
 
 
+def _contacts(touch: Sequence[Stream], free: Sequence[np.ndarray], config: LiveConfig, side: int) -> dict[str, Contact]:
+    """The contact detector of each touch sensor by its name."""
+    if len(free) not in (0, len(touch)):
+        raise ValueError(f"{len(free)} background(s) for {len(touch)} touch sensor(s): give one of each, or none")
+    pairs = zip_longest(touch, [s.origin.cropped(image) for s, image in zip(touch, free, strict=False)])
+    return {stream.name: Contact(config, side, image) for stream, image in pairs if stream}
+
+
 class Live:
     """Predictions from streams of frames. Call ``tick`` whenever a frame may have come."""
 
@@ -91,11 +99,7 @@ class Live:
         """Whether the learned background is subtracted from touch. It also stands for the first frame of a touch."""
         side = engine.inputs["touch"][0] if self.minus_rest and "touch" in streams else 0
         self._since: dict[str, float] = {}
-        touch = streams.get("touch", ())
-        if len(free) not in (0, len(touch)):
-            raise ValueError(f"{len(free)} background(s) for {len(touch)} touch sensor(s): give one of each, or none")
-        pairs = zip_longest(touch, [s.origin.cropped(image) for s, image in zip(touch, free, strict=False)])
-        self.contacts = {stream.name: Contact(config, side, image) for stream, image in pairs if stream}
+        self.contacts = _contacts(streams.get("touch", ()), free, config, side)
         self.counts: Counter[str] = Counter()
         self._ages = np.zeros(NUM_AGES)
         self.age = self.max_age = 0.0
