@@ -23,7 +23,7 @@ class _ProbeOptions:
     """Folder of each finished run: seeds of one method, or several methods, on the same data."""
     encoder: tuple[str, ...] = ()
     """Other people's encoders to probe on --on, e.g. external:timm/NAME, external:sparsh:FILE or external:FILE.onnx
-    (docs/encoders.md)."""
+    (docs/bench.md)."""
     config: Annotated[ProbeConfig, tyro.conf.arg(name="")] = ProbeConfig()
     on: Path | None = None
     """Probe on this pack instead of the data the runs were trained on."""

@@ -71,8 +71,8 @@ class _FindOptions:
     """File of mvitac embed; --shared, if touch is to find vision."""
     source: Annotated[Literal["touch", "vision"], tyro.conf.arg(name="from")] = "touch"
     """Modality of the picture."""
-    target: Annotated[Literal["touch", "vision"], tyro.conf.arg(name="to")] = "vision"
-    """Modality to compare it with."""
+    target: Annotated[Literal["touch", "vision"] | None, tyro.conf.arg(name="to")] = None
+    """Modality to compare it with. Default: the other one, if the model has it."""
     background: tuple[Path, ...] = ()
     """For a model of difference images: the touch sensor without contact, as many files as the picture. Without it the
     picture must be a difference image already."""
@@ -98,8 +98,9 @@ def find(argv: list[str]) -> None:
     check_json(options.sheet, "--sheet")
     model = load(options.model)
     known = Embeddings(options.known, model.weights_digest())
+    target = options.target or next((m for m in model.encoders if m != options.source), options.source)
     query, background = _picture(options.image), _picture(options.background) if options.background else None
-    rows, cosines = known.find(model, query, options.source, options.target, options.num, background=background)
+    rows, cosines = known.find(model, query, options.source, target, options.num, background=background)
     found = [
         {
             "cosine": round(float(cosine), 6),
@@ -112,14 +113,14 @@ def find(argv: list[str]) -> None:
         [f"{o['cosine']:.3f}", o["id"], o["group"], *(o["labels"].get(t, "") for t in known.classes)] for o in found
     ]
     table = tabulate(lines, ["cosine", "id", "group", *known.classes], disable_numparse=True)
-    title = f"{options.source} -> {options.target} in {options.known}"
+    title = f"{options.source} -> {target} in {options.known}"
     print(title, table, "", sep="\n", file=printed_to(options.json))
-    save_json(options.json, {"from": options.source, "to": options.target, "found": found})
+    save_json(options.json, {"from": options.source, "to": target, "found": found})
     if options.sheet:
         pack = Pack(known.pack, verify=False)
         if pack.digest != known.pack_digest:
             raise ValueError(f"{pack.path} is another pack than the one that was embedded: embed it again")
-        tiles = [(pack.images[options.target][one["row"]], f"{one['cosine']:.3f} {one['id']}") for one in found]
+        tiles = [(pack.images[target][one["row"]], f"{one['cosine']:.3f} {one['id']}") for one in found]
         blocks = [("query", [(query, "")]), ("found", tiles)]
         sheet = draw(
             title, [(name, [(side_by_side(fit(x, _SIDE)), text) for x, text in some]) for name, some in blocks]
