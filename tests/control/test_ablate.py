@@ -144,6 +144,19 @@ def test_contact_is_the_column_where_there_is_one(pack: Pack, cells: list[Any]) 
     assert not np.array_equal(read_episodes(pack).touched, asked)
 
 
+def test_episodes_that_say_nothing(pack: Pack) -> None:
+    """Touch that is not there is black, and actions that never change have no scale: both were "does not use touch"."""
+    made = copy.copy(pack)
+    made.table = pack.table.append_column("has_touch", pa.array(np.arange(pack.num) > 4))
+    with pytest.raises(ValueError, match="5 rows have no touch"):
+        read_episodes(made)
+    for value in (np.nan, 3.0):
+        made = copy.copy(pack)
+        made.values = lambda task, value=value: np.full((pack.num, 2), value)  # type: ignore[method-assign,misc]
+        with pytest.raises(ValueError, match="values action never change"):
+            read_episodes(made)
+
+
 def test_in_contact_and_over_time(pack: Pack) -> None:
     rows = ablate(needs, read_episodes(pack))["rows"]
     worse = next(row for row in rows if row["sense"] == "touch" and row["kind"] == "another episode")["parts"]
@@ -191,5 +204,18 @@ def test_command(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     file.write_text("def policy(o):\n    return [0.0]\n")
     assert main(["ablate", f"{file}:policy", "--data", str(pack.path)]) == 2
     assert "gives 1 numbers" in capsys.readouterr().err
+    for code, says in (
+        ("return [np.nan, 0]", "gives [nan 0.] in step 0 of episode 1"),
+        ("raise KeyError('gel')", "fails (KeyError: 'gel') in step 0"),
+        ("sys.exit(0)", "fails (SystemExit: 0)"),
+        ("return None", "gives [nan]"),
+    ):
+        file.write_text(f"import sys, numpy as np\ndef policy(o):\n    {code}\n")
+        assert main(["ablate", f"{file}:policy", "--data", str(pack.path)]) == 2
+        assert says in capsys.readouterr().err
+    file.write_text("import nothing_such\n")
+    with pytest.raises(ValueError, match=r"mine.py cannot be imported \(ModuleNotFoundError: .*nothing_such"):
+        open_policy(f"{file}:policy")
+    file.write_text("def policy(o): ...\n")
     with pytest.raises(ValueError, match="no function other"):
         open_policy(f"{file}:other")

@@ -31,6 +31,7 @@ from mvitac.data.windows import places
 from mvitac.deploy.artifact import load
 from mvitac.evaluation.intervals import mean_interval
 from mvitac.registry import unknown
+from mvitac.system.files import brief
 from mvitac.system.progress import work
 
 Policy = Callable[[dict[str, Any]], Any]
@@ -85,6 +86,12 @@ def read_episodes(pack: Pack) -> Episodes:
         raise ValueError(
             f"{pack.path} has no touch, or no values named action: pack it with --values action=a:mm,b:deg"
         )
+    for sense in pack.spec.modalities:
+        if not (there := pack.has(sense)).all():  # it would be black, which no policy can use
+            raise ValueError(f"{pack.path}: {(~there).sum()} rows have no {sense}: pack them without --allow-missing")
+    least, most = np.fmin.reduce(values["action"]), np.fmax.reduce(values["action"])
+    if not (least < most).any():
+        raise ValueError(f"{pack.path}: values action never change, so no policy can be told from another")
     which = np.unique(pack.column("group").astype(str), return_inverse=True)[1]
     by = np.lexsort((places(pack, pack.spec.window)[1], which))
     rows = np.split(by, np.cumsum(np.bincount(which))[:-1])
@@ -130,7 +137,10 @@ def open_policy(text: str) -> Policy:
     place, _, name = text.rpartition(":")
     if not place:
         raise ValueError(f"{text!r} is no policy: give module:function, FILE.py:function or a LeRobot policy's folder")
-    module = runpy.run_path(place) if place.endswith(".py") else vars(importlib.import_module(place))
+    try:
+        module = runpy.run_path(place) if place.endswith(".py") else vars(importlib.import_module(place))
+    except (Exception, SystemExit) as error:  # whatever the owner's code raises
+        raise ValueError(f"{place} cannot be imported ({type(error).__name__}: {brief(error)})") from None
     if not callable(found := module.get(name)):
         raise ValueError(f"{place} has no function {name}")
     return found
@@ -191,7 +201,7 @@ def act(
                 given[sense] = replaced(number, step, seen[0])
             if watch:
                 watch(world, given)
-            action = np.asarray(policy(given) if policy else world.answer(world.known), float).ravel()
+            action = _action(policy, given, number) if policy else np.ravel(world.answer(world.known))
             width = len(world.most) if episodes.actions is None else episodes.actions.shape[1]
             if len(action) != width:
                 raise ValueError(f"the policy gives {len(action)} numbers, episodes have actions of {width}")
@@ -201,6 +211,17 @@ def act(
         losses += [world.loss] * step
         lengths.append(step)
     return np.stack(actions), np.array(losses), np.split(np.arange(len(losses)), np.cumsum(lengths)[:-1])
+
+
+def _action(policy: Policy, given: dict[str, Any], number: int) -> np.ndarray:
+    """What ``policy`` answers [T]; ValueError if that is not finite numbers, or it raises anything."""
+    try:
+        if np.isfinite(action := np.asarray(policy(given), float).ravel()).all():
+            return action
+        why = f"gives {action}"
+    except (Exception, SystemExit) as error:  # whatever the owner's code raises
+        why = f"fails ({type(error).__name__}: {brief(error)})"
+    raise ValueError(f"the policy {why} in step {given['step']} of episode {number + 1}")
 
 
 def replacement(kind: str, images: Any, rows: Sequence[np.ndarray]) -> Callable[[int, int, np.ndarray], np.ndarray]:
