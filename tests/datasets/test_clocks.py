@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import csv
 import json
+import os
 import re
 import time
 from collections.abc import Callable
@@ -200,12 +201,24 @@ def test_logs_that_would_give_wrong_numbers(tmp_path: Path, change: Callable[[Pa
     ("options", "says"),
     [
         ({"log": ("force.csv",)}, r"log 'force\.csv': write FILE:COLUMN"),
+        ({"log": ("force:stamp",)}, r"force cannot be read as a table: it is no file of \.csv"),
+        ({"log": ("pipe.csv:stamp",)}, r"pipe\.csv cannot be read as a table: it is no file of"),
         ({"log": ("force.csv:stamp", "force.csv:stamp")}, r"both have a column 'Fz': rename one"),
     ],
 )
 def test_logs_that_cannot_be_joined(tmp_path: Path, options: dict[str, Any], says: str) -> None:
+    root = recorded(tmp_path / "set", num=1)
+    os.mkfifo(root / "0/pipe.csv")  # reading it would wait for ever
     with pytest.raises(ValueError, match=says):
-        packed(recorded(tmp_path / "set", num=1), tmp_path / "p", **{**LOG, **options})
+        packed(root, tmp_path / "p", **{**LOG, **options})
+
+
+def test_rows_with_one_stamp_are_counted(tmp_path: Path) -> None:
+    root = recorded(tmp_path / "set", num=2)
+    spoil(36, stamp=lambda _: "0.34")(root)
+    spoil(37, 38, stamp=lambda _: "0.39")(root)
+    note = next(note for note in packed(root, tmp_path / "p", **LOG).spec.notes if "joined" in note)
+    assert "of its rows have the stamp of another, of which one counts" in note
 
 
 def test_stamps_are_seconds_whatever_their_unit(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -73,6 +73,22 @@ def test_topics_are_joined_by_the_time_in_their_headers(tmp_path: Path, plugin: 
     assert few.images["touch"][:, 0, 0, 2].tolist() == list(range(0, 250, 25))
 
 
+@pytest.mark.parametrize("plugin", StoragePlugin)
+def test_messages_received_in_the_same_moment_are_not_one(tmp_path: Path, plugin: StoragePlugin) -> None:
+    """A recorder that writes in bursts gives many messages one time of receipt; each image was the first of them."""
+    for number in range(3):
+        with Writer(tmp_path / f"bags/{number}", version=9, storage_plugin=plugin) as bag:
+            kind = "sensor_msgs/msg/Image"
+            gel, _ = (bag.add_connection(topic, kind, typestore=STORE) for topic in (GEL, "/none"))
+            for i in range(30):
+                message = raw(i / 25, np.full((16, 20, 3), 5 * i, np.uint8), "rgb8")
+                bag.write(gel, (START + i // 10) * 10**9, STORE.serialize_cdr(message, kind))
+    pack = packed(RosbagConfig(path=tmp_path / "bags", touch=(GEL,), every=1), tmp_path / "pack")
+    assert pack.images["touch"][:, 0, 0, 0].tolist() == [*range(0, 150, 5)] * 3
+    with pytest.raises(ValueError, match="0 has no image of /none"):
+        RosbagConfig(path=tmp_path / "bags", touch=("/none",)).source()
+
+
 def test_depth_and_what_cannot_be(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", StoragePlugin.MCAP, 0, np.full((16, 20, 1), 900, np.uint16))
     scale = (f"{GEL}=0:1000", f"{FRONT}=0:1800")

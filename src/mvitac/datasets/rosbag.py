@@ -63,6 +63,8 @@ class RosbagConfig(RecordedConfig):
         for bag in _bags(self.path):
             seen = _read(bag, cameras, [name for name in dict.fromkeys(named) if name])
             own = seen[cameras[0]][0][::every]
+            if not len(own):
+                raise ValueError(f"{bag} has no image of {cameras[0]}: is it complete?")
             good = np.ones(len(own), bool)
             cells: list[Row] = [{} for _ in own]
             at: dict[str, list[int]] = {}
@@ -80,7 +82,7 @@ class RosbagConfig(RecordedConfig):
             for i in np.flatnonzero(good).tolist():
                 rows.append(recording_row(name.removesuffix(".bag"), i * every, float(own[i])) | cells[i])
                 for topic in cameras:
-                    images[topic].append(Message(str(bag), topic, at[topic][i]))
+                    images[topic].append(Message(str(bag), topic, *at[topic][i]))
         note = (
             f"topics are joined by time within {self.tolerance:g} s; {dropped} images without all others are left out"
         )
@@ -115,7 +117,7 @@ def _opened(bag: Path) -> Iterator[Any]:
 
 
 def _read(bag: Path, cameras: Sequence[str], asked: Sequence[str]) -> dict[str, tuple[np.ndarray, list[Any]]]:
-    """Return topic -> ascending times in seconds, with when each message was received in ns (images) or its fields."""
+    """Return topic -> ascending times in seconds, with the place of each message (images) or its fields."""
     with _opened(bag) as reader:
         topics = {connection.topic: connection.msgtype for connection in reader.connections}
         if not cameras:
@@ -130,14 +132,25 @@ def _read(bag: Path, cameras: Sequence[str], asked: Sequence[str]) -> dict[str, 
         found: dict[str, list[tuple[float, Any]]] = {
             topic: [] for topic in (*cameras, *(t for t in fields if fields[t]))
         }
-        for connection, received, raw in reader.messages([c for c in reader.connections if c.topic in found]):
+        asked_for = [c for c in reader.connections if c.topic in found]
+        for connection, place, raw in _placed(reader.messages(asked_for)):
+            received = place[0]
             topic, message = connection.topic, reader.deserialize(raw, connection.msgtype)
             stamp = getattr(getattr(message, "header", None), "stamp", None)
             time = 1e-9 * received if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
             row = {name: _field(message, name.removeprefix(f"{topic}.")) for name in fields.get(topic, ())}
-            found[topic].append((time or 1e-9 * received, row or received))
+            found[topic].append((time or 1e-9 * received, row or place))
     ordered = {topic: sorted(each, key=lambda one: one[0]) for topic, each in found.items()}
     return {topic: (np.array([time for time, _ in each]), [v for _, v in each]) for topic, each in ordered.items()}
+
+
+def _placed(messages: Iterator[Any]) -> Iterator[tuple[Any, tuple[int, int], Any]]:
+    """Messages with when they were received in ns, and their number among those of the topic in the same ns."""
+    last: dict[str, tuple[int, int]] = {}
+    for connection, received, raw in messages:
+        stamp, number = last.get(connection.topic, (received, -1))
+        last[connection.topic] = place = (received, number + 1 if stamp == received else 0)
+        yield connection, place, raw
 
 
 def _field(message: Any, path: str) -> str:
@@ -153,13 +166,14 @@ def _field(message: Any, path: str) -> str:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Message(ImageRef):
-    """The message of ``topic`` received at ``stamp`` (ns) in the bag ``path``."""
+    """Message ``number`` (from 0) of those of ``topic`` received at ``stamp`` (ns) in the bag ``path``."""
 
     topic: str
     stamp: int
+    number: int = 0
 
     def __str__(self) -> str:
-        return f"{self.path} {self.topic} at {self.stamp} ns"
+        return f"{self.path} {self.topic} at {self.stamp} ns" + f", number {self.number}" * bool(self.number)
 
     def container(self) -> Hashable:
         return (self.path, self.topic)
@@ -168,9 +182,9 @@ class Message(ImageRef):
     def opened(self) -> Iterator[tuple[Any, Iterator[Any]]]:
         with _opened(Path(self.path)) as reader:
             own = [connection for connection in reader.connections if connection.topic == self.topic]
-            yield reader, reader.messages(own, start=self.stamp)
+            yield reader, _placed(reader.messages(own, start=self.stamp))
 
     def stored(self, container: tuple[Any, Iterator[Any]]) -> bytes | np.ndarray:
         reader, messages = container
-        connection, _, raw = next(found for found in messages if found[1] == self.stamp)
+        connection, _, raw = next(found for found in messages if found[1] == (self.stamp, self.number))
         return ros_pixels(reader.deserialize(raw, connection.msgtype), str(self))

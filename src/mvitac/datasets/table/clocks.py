@@ -95,12 +95,13 @@ def join(
         name, column, shift = _parsed(text)
         times, recordings = row_times(table, column, refs)
         made: list[Row] = [{} for _ in table.rows]
-        gap = 0.0
+        gap, same = 0.0, 0
         for file, at in _files(table, name, refs).items():
             _check_apart(file, times[at], [recordings[i] for i in at])
             log = with_elements(read_manifest(file), numbers)
             log.check(column)
             stamps = seconds(log.filled(column, "time"), f"{file}, column {column}") + shift
+            same += len(stamps) - len(np.unique(stamps))
             cells, largest = joined(log, stamps, times[at], (numbers if linear else ()), tolerance)
             gap = max(gap, largest)
             if not any(cells):
@@ -117,6 +118,7 @@ def join(
         lost = f"; {there.count(False)} of {len(there)} rows are not within {tolerance:g} s of it and left out"
         note = f"{name} joined by {text.removeprefix(f'{name}:')}, its largest gap is {gap:.3g} s"
         note += lost * (not all(there))
+        note += f"; {same} of its rows have the stamp of another, of which one counts" * bool(same)
         rows = [{**row, **{c: more.get(c, "") for c in names}} for row, more in zip(table.rows, made, strict=True)]
         table = replace(table, rows=rows, digest=digest([table.digest, made]), notes=(*table.notes, note))
         table = table.kept(there, "")

@@ -187,6 +187,8 @@ def in_clone(path: Path, inside: str, pattern: str, url: str) -> Path:
 def read_manifest(file: Path) -> Manifest:
     """Read a table with named columns."""
     try:
+        if file.suffix.lower() not in READERS or (file.exists() and not file.is_file()):  # a pipe never ends
+            raise ValueError(f"it is no file of {', '.join(READERS)}")
         rows = READERS[file.suffix.lower()](file)
     except (ValueError, OSError, csv.Error, pa.ArrowException) as error:  # ValueError: not UTF-8, too
         raise ValueError(f"{file} cannot be read as a table: {brief(error)}") from None
