@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zlib
 from pathlib import Path
 from typing import Any
@@ -59,6 +60,12 @@ def test_a_file_of_another_format_starts_no_program(tmp_path: Path, monkeypatch:
         with pytest.raises(ValueError, match=r"x\.png cannot be read as an image"):
             read()
     assert not ran.exists()
+
+
+def test_a_pipe_is_no_image(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.png")  # reading it would wait for ever
+    with pytest.raises(ValueError, match=r"a\.png cannot be read as an image \(it is no file\)"):
+        decode(tmp_path / "a.png")
 
 
 @pytest.mark.parametrize("side", [9_000, 60_000])

@@ -143,6 +143,8 @@ def test_by_features_only_like_finds_like(artifact: Path, pack: Pack, tmp_path: 
     assert known.find(model, pack.images["touch"][row], "touch", "touch", 1)[0].tolist() == [[row]]
     with pytest.raises(ValueError, match="touch finds no vision: embed with --shared"):
         known.find(model, pack.images["touch"][row], "touch", "vision", 1)
+    with pytest.raises(ValueError, match="num 0: give 1 or more"):
+        known.find(model, pack.images["touch"][row], "touch", "touch", 0)
 
 
 NUM = 72

@@ -45,6 +45,8 @@ def decode(path: str | Path | BinaryIO, name: str = "", span: Sequence[float] = 
     """
     name = name or str(path)
     try:
+        if isinstance(path, str | Path) and Path(path).exists() and not Path(path).is_file():  # a pipe never ends
+            raise ValueError("it is no file")
         with Image.open(path, formats=FORMATS) as image:
             if image.width * image.height > MAX_PIXELS:
                 raise ValueError(f"it has {image.width} x {image.height} pixels: at most {MAX_PIXELS:,} are read")

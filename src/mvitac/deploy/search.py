@@ -81,6 +81,8 @@ class Embeddings:
         ``images`` [Q] and ``background`` are as for ``Model.embed``. Returns numbers of rows of the file and cosines,
         both [Q, k], best first.
         """
+        if k < 1:
+            raise ValueError(f"num {k}: give 1 or more")
         if target not in self.banks:
             raise unknown("modality", target, self.banks)
         if source != target and not self.shared:

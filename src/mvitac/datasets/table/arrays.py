@@ -11,6 +11,7 @@ has all episodes in one group, and their ends (exclusive) in meta/episode_ends.
 """
 
 from collections.abc import Collection, Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +72,21 @@ def _datasets(group: Any) -> dict[str, Any]:
     """Return the datasets below ``group`` by their path; ValueError if one shows the content of other files."""
     if hasattr(group, "members"):  # zarr
         return dict(sorted((path, item) for path, item in group.members(max_depth=None) if hasattr(item, "shape")))
+    import h5py
+
     found: dict[str, Any] = {}
-    group.visititems(lambda path, item: found.update({path: item} if getattr(item, "shape", None) is not None else {}))
+    seen, left = set(), [("", group)]
+    while left:  # as visititems, which takes minutes where thousands of groups are inside each other
+        path, item = left.pop()
+        where = h5py.h5o.get_info(item.id)
+        if (where.fileno, where.addr) in seen:
+            continue
+        seen.add((where.fileno, where.addr))
+        if getattr(item, "shape", None) is not None:
+            found[path[1:]] = item
+        for name in sorted(item, reverse=True) if isinstance(item, h5py.Group) else ():
+            if isinstance(item.get(name, getlink=True), h5py.HardLink):
+                left.append((f"{path}/{name}", item[name]))
     for path, data in found.items():
         if data.external or data.is_virtual:
             raise ValueError(f"{group.file.filename}: {path} shows the content of other files: copy it into this one")
@@ -187,9 +201,9 @@ def _at(opened: Any, name: str) -> Any:
 def _constants(opened: Any, name: str, vectors: Collection[str], left_out: LeftOut) -> dict[str, list[str]]:
     """Return the attributes of group ``name`` and of those above it; the nearest counts."""
     cells: dict[str, list[str]] = {}
-    parts = name.split("/") if name else []
-    for depth in range(len(parts) + 1):
-        for column, value in _at(opened, "/".join(parts[:depth])).attrs.items():
+    # From group to group: the path of each from the root would take minutes where there are thousands.
+    for group in accumulate(name.split("/") if name else [], _at, initial=opened):
+        for column, value in group.attrs.items():
             plain = np.asarray(value).tolist()
             plain = plain[0] if isinstance(plain, list) and len(plain) == 1 else plain
             plain = plain.decode() if isinstance(plain, bytes) else plain
