@@ -14,6 +14,7 @@ from PIL import ExifTags, Image
 from mvitac.cli.search import _picture
 from mvitac.data.build import build
 from mvitac.data.images import decode, fit
+from mvitac.data.video import frame_times
 from mvitac.datasets.folder import FolderConfig
 from mvitac.live.cameras import Folder
 from mvitac.transforms.preprocess import to_array
@@ -66,6 +67,9 @@ def test_a_pipe_is_no_image(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.png")  # reading it would wait for ever
     with pytest.raises(ValueError, match=r"a\.png cannot be read as an image \(it is no file\)"):
         decode(tmp_path / "a.png")
+    os.mkfifo(tmp_path / "a.mp4")
+    with pytest.raises(ValueError, match=r"a\.mp4 is no file"):
+        frame_times(tmp_path / "a.mp4")
 
 
 @pytest.mark.parametrize("side", [9_000, 60_000])

@@ -201,6 +201,8 @@ def _shown(packet: Packet) -> int:
 @contextlib.contextmanager
 def _opened(path: str | Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     """Open a file and its video stream; errors name the file and say what to do."""
+    if Path(path).exists() and not Path(path).is_file():
+        raise ValueError(f"{path} is no file: a pipe would be waited for for ever")
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:

@@ -67,7 +67,7 @@ class RosbagConfig(RecordedConfig):
                 raise ValueError(f"{bag} has no image of {cameras[0]}: is it complete?")
             good = np.ones(len(own), bool)
             cells: list[Row] = [{} for _ in own]
-            at: dict[str, list[int]] = {}
+            at: dict[str, list[Any]] = {}
             for topic, (times, found) in seen.items():
                 if topic in cameras:
                     index, away = nearest(times, own)

@@ -73,12 +73,13 @@ def _datasets(group: Any) -> dict[str, Any]:
     if hasattr(group, "members"):  # zarr
         return dict(sorted((path, item) for path, item in group.members(max_depth=None) if hasattr(item, "shape")))
     import h5py
+    from h5py import h5o
 
     found: dict[str, Any] = {}
     seen, left = set(), [("", group)]
     while left:  # as visititems, which takes minutes where thousands of groups are inside each other
         path, item = left.pop()
-        where = h5py.h5o.get_info(item.id)
+        where = h5o.get_info(item.id)
         if (where.fileno, where.addr) in seen:
             continue
         seen.add((where.fileno, where.addr))
