@@ -73,7 +73,7 @@ def _datasets(group: Any) -> dict[str, Any]:
     if hasattr(group, "members"):  # zarr
         return dict(sorted((path, item) for path, item in group.members(max_depth=None) if hasattr(item, "shape")))
     import h5py
-    from h5py import h5o
+    from h5py import h5o  # type: ignore[attr-defined]
 
     found: dict[str, Any] = {}
     seen, left = set(), [("", group)]
