@@ -1,6 +1,7 @@
 """A policy that needs touch, one that ignores it, and one that only reacts to it are told apart."""
 
 import copy
+import re
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -184,14 +185,19 @@ def test_film_and_learned_policy(tmp_path: Path, capsys: pytest.CaptureFixture[s
     result = ablate(suite_policy(suite, ("touch", "4"), "pixels"), episodes)
     assert [row["sense"] for row in result["rows"]] == ["touch"] * 4 and result["unit"] == "failures"
     pictures = film(episodes, [("expert", None, ""), ("none", lambda o: [0.0, 0.0], "mean frame")])
-    (tmp_path / "a.webp").write_bytes(encoded(pictures, "webp"))
+    (tmp_path / "a.webp").write_bytes(encoded(pictures, ".webp"))
     with Image.open(tmp_path / "a.webp") as made:
         assert made.n_frames == 18 and made.size == (288, 288)
-    (tmp_path / "a.jpg").write_bytes(encoded(pictures, "jpg"))
+    (tmp_path / "a.jpg").write_bytes(encoded(pictures, ".jpg"))
     with Image.open(tmp_path / "a.jpg") as made:
         assert made.size == (3 * 288, 288)
-    for text, why in (("insert-v1/touch/31", "unknown task and condition"), ("nowhere", "--out is a film of a suite")):
-        assert main(["ablate", "pixels", "--data", text, "--out", str(tmp_path / "b.webp")]) == 2
+    for text, out, why in (
+        ("insert-v1/touch/31", "b.webp", "unknown task and condition"),
+        (".", "b.webp", "--out is a film of a suite"),
+        ("insert-v1/touch/30", "b.mp4", "b.mp4 is no film"),
+        ("insert-v1/touch/30", "a.jpg/b.gif", "cannot be written"),
+    ):
+        assert main(["ablate", "pixels", "--data", text, "--out", str(tmp_path / out)]) == 2
         assert why in capsys.readouterr().err
 
 
@@ -199,7 +205,8 @@ def test_command(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     file = tmp_path / "mine.py"
     file.write_text("def policy(o):\n    return [o['touch'].mean() - 60, o['step']]\n")
     assert main(["ablate", f"{file}:policy", "--data", str(pack.path), "--json", str(tmp_path / "a.json")]) == 0
-    assert "The policy uses touch" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "The policy uses touch" in printed and re.search(r"\+0\.00 +\+0\.00 *\n", printed)  # of the camera
     assert '"verdicts"' in (tmp_path / "a.json").read_text()
     file.write_text("def policy(o):\n    return [0.0]\n")
     assert main(["ablate", f"{file}:policy", "--data", str(pack.path)]) == 2

@@ -9,7 +9,7 @@ from mvitac.cli.options import check_json, parse, printed_to, save_json
 from mvitac.control.ablate import PLAUSIBLE, open_policy, read_episodes, report, suite_episodes, suite_policy
 from mvitac.control.ablate import ablate as compare
 from mvitac.control.result import find_suite, shipped
-from mvitac.control.video import encoded, film
+from mvitac.control.video import FORMATS, encoded, film
 from mvitac.data.pack import Pack
 from mvitac.system.progress import shown
 
@@ -25,7 +25,8 @@ class _Options:
     """Folder of a pack: its groups are the episodes, and its values "action" what was demonstrated. Or a suite, a task and
     a condition for a closed loop: "insert-v1/both/30", "servo-v1/corner/known sensor"."""
     out: Path | None = None
-    """Of a suite, also write a film of its first episode, with and without its own touch: .webp or .gif, else a still."""
+    """Of a suite, also write a film of its first episode, with its own and with another's touch: .webp or .gif; or a still
+    of it: .jpg or .png."""
     json: Path | None = None
     """Also write everything that is printed to this file; - = stdout, and the tables to stderr."""
 
@@ -34,7 +35,10 @@ def ablate(argv: list[str]) -> None:
     """mvitac ablate POLICY --data EPISODES [--out FILM] [--json FILE]"""
     options = parse(_Options, argv, "ablate")
     check_json(options.json)
-    name, *cell = options.data.parts
+    check_json(options.out, "--out")
+    if options.out and options.out.suffix not in FORMATS:
+        raise ValueError(f"--out {options.out} is no film: its name ends with {', '.join(FORMATS)}")
+    name, *cell = str(options.data).split("/")
     if name in shipped():
         suite, cell = find_suite(name), tuple(cell)
         episodes = suite_episodes(suite, cell)
@@ -47,6 +51,6 @@ def ablate(argv: list[str]) -> None:
         result = compare(policy, episodes)
     if options.out:
         runs = [("as it is", policy, ""), ("touch of another episode", policy, PLAUSIBLE[0])]
-        options.out.write_bytes(encoded(film(episodes, runs), options.out.suffix[1:]))
+        options.out.write_bytes(encoded(film(episodes, runs), options.out.suffix))
     print(report(result), file=printed_to(options.json))
     save_json(options.json, result, sealed=True)

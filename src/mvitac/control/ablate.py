@@ -319,4 +319,4 @@ def report(result: Mapping[str, Any]) -> str:
         lines.append([row["sense"], row["kind"], change, worse, f"{row['error'][3]:.2g}", *parts])
     error = "{:.2f} [{:.2f}, {:.2f}]".format(*result["error"])
     about = f"{result['episodes']} episodes, error {error}, in {result['unit']}"
-    return "\n".join([about, tabulate(lines, head), *result["verdicts"].values()])
+    return "\n".join([about, tabulate(lines, head, disable_numparse=True), *result["verdicts"].values()])

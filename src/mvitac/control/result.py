@@ -178,7 +178,7 @@ def write_page(files: Sequence[Path], out: Path) -> Path:
     sections[0][2].insert(0, page.paragraph(note(suite, values)))
     episodes = suite_episodes(suite, next(cell for cell in suite.cells(OWN) if cell[0] == suite.kinds[2]))
     still = np.zeros(len(episodes.begin[0]().most))
-    data = encoded(film(episodes, [(suite.true, None, ""), ("no action", lambda given: still, "")]), "webp")
+    data = encoded(film(episodes, [(suite.true, None, ""), ("no action", lambda given: still, "")]), ".webp")
     image = page.image(data_uri(data, "webp"), "What is seen, and the error in mm and degrees")
     sections.append(("film", "An episode", [page.figure(image)]))
     text = str(page.page(f"mvitac bench: {suite.name}", head, sections, "Made by mvitac bench board."))
