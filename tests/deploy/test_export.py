@@ -145,6 +145,18 @@ def test_int8_reports_what_it_keeps_and_runs(int8: Path, pack: Pack, model: Mode
         assert cosines(found["embedding_touch"], model.embed(**images)["touch"].numpy()).min() > 0.9
 
 
+def test_int8_without_vnni_is_computed_by_onnxruntime(int8: Path, onnx: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    used: list[str] = []
+    for name in ("_openvino", "_onnxruntime"):
+        monkeypatch.setattr(runtime, name, lambda *_, name=name: used.append(name))
+    for isa in ("AVX2", "ALL"):
+        monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", isa)
+        monkeypatch.setattr(Path, "read_text", lambda self: "flags: avx512_vnni")
+        for folder, precision in ((int8, "int8"), (onnx, "fp32")):
+            open_model(folder / "model.onnx", "auto", precision)
+    assert used == ["_onnxruntime", "_openvino", "_openvino", "_openvino"]
+
+
 def open_int8(said: Path, folder: Path, ones: Path) -> None:
     Engine(folder, engine="openvino", threads=1)
     found = open_model(ones, "openvino")([np.ones((1, 64, 8, 8), np.float32)])[0]
