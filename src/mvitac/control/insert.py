@@ -24,6 +24,7 @@ from mvitac.control.learn import Lesson
 from mvitac.control.servo import FIELD_MM, SIZE, Copy, Shape, draw_copy, draw_shape, textured, textures
 from mvitac.control.suite import SHUFFLED, Cell, LoopSuite
 from mvitac.evaluation.intervals import interval
+from mvitac.sim.camera import cast, rays_of
 from mvitac.sim.coordinates import grid
 
 LENGTH_M, DEPTH_M, CLEAR_M = 0.024, 0.010, 0.0012  # of the peg below the hand; of the insertion; beside the peg
@@ -58,8 +59,8 @@ def draw_peg(seed: int, number: int, trained: bool) -> tuple[Peg, float]:
     """The peg of an episode in its hand, and the place of the slot in mm."""
     rng = np.random.default_rng([_TAG, seed, int(trained), number])
     slot, offset, turn = (float(rng.uniform(-most, most)) for most in REACH.values())
-    known = {key: getattr(_held(seed)[0], key) for key in ("kind", "texture", "roll_mm", "waves")}
-    return Peg(**known, half_mm=3.5, offset_mm=offset, turn_deg=turn), slot
+    own = {"half_mm": 3.5, "offset_mm": offset, "turn_deg": turn}
+    return Peg(**{**vars(_held(seed)[0]), **own}), slot
 
 
 class Insertion:
@@ -110,7 +111,7 @@ class Insertion:
         if sense == "touch":
             return touch_of(self.key).copy()
         mujoco.mj_kinematics(self.model, self.data)  # of where the last step ended
-        return _photograph(self.model, self.data, (*self.key, self.steps))
+        return _photograph(self)
 
     def answer(self, estimate: np.ndarray) -> np.ndarray:
         return estimate
@@ -126,14 +127,10 @@ class Insertion:
         deep = self.data.site_xpos[0, 2] < -suite.success_depth * DEPTH_M
         return float(mm <= suite.success_mm and deg <= suite.success_deg and deep), mm, deg
 
-    def _height(self) -> float:
-        down = max(0, self.steps - ALIGN) / DOWN
-        return LENGTH_M + ABOVE_M - down * (ABOVE_M + DEPTH_M)
-
     def _go(self) -> None:
         """Move the set point there and let physics follow."""
-        half = math.radians(self.turn_deg) / 2
-        self.data.mocap_pos[0] = self.x_mm / 1000, 0, self._height()
+        half, down = math.radians(self.turn_deg) / 2, max(0, self.steps - ALIGN) / DOWN
+        self.data.mocap_pos[0] = self.x_mm / 1000, 0, LENGTH_M + ABOVE_M - down * (ABOVE_M + DEPTH_M)
         self.data.mocap_quat[0] = math.cos(half), 0, math.sin(half), 0
         mujoco.mj_step(self.model, self.data, SUBSTEPS if self.steps else 1)
 
@@ -150,14 +147,12 @@ def _scene(peg: Peg, slot_mm: float) -> str:
     """A block with a slot, and the hand at the pad's centre with shroud and peg; the block's top is z = 0."""
     half, slot = peg.half_mm / 1000, slot_mm / 1000
     gap, lean = half + CLEAR_M, math.radians(peg.turn_deg)
+    beside, behind = gap + 0.015, 0.0135
+    boxes = [(slot - beside, 0, 0.015, 0.018), (slot + beside, 0, 0.015, 0.018)]
+    boxes += [(slot, -behind, gap, 0.0045), (slot, behind, gap, 0.0045)]
     walls = "".join(
         f'<geom name="block{i}" type="box" size="{w} {d} .01" pos="{x} {y} -.01"/>'
-        for i, (x, y, w, d) in enumerate(
-            (
-                *((slot + side * (gap + 0.015), 0, 0.015, 0.018) for side in (-1, 1)),
-                *((slot, side * 0.0135, gap, 0.0045) for side in (-1, 1)),
-            )
-        )
+        for i, (x, y, w, d) in enumerate(boxes)
     )
     at, down = peg.offset_mm / 1000, LENGTH_M
     place = f"{at - math.sin(lean) * down / 2} 0 {-math.cos(lean) * down / 2}"
@@ -180,29 +175,20 @@ def _scene(peg: Peg, slot_mm: float) -> str:
     <equality><weld body1="hand" body2="target" solref=".02 1"/></equality></mujoco>"""
 
 
-def _photograph(model: Any, data: Any, key: tuple[int, ...]) -> np.ndarray:
+def _photograph(world: Insertion) -> np.ndarray:
     """One ray per pixel from over the shoulder. Colours are those of one place; the lamp changes between episodes."""
-    rng, own = np.random.default_rng([_VIEW, *key[:3]]), np.random.default_rng([_VIEW, key[0]])
-    eye, ahead = np.array([0.0, -0.13, 0.1]), np.array([0.0, 0.13, -0.095])
-    ahead /= np.linalg.norm(ahead)
-    right = np.array([1.0, 0, 0])
-    up = np.cross(right, ahead)
-    u = ((np.arange(SIZE) + 0.5) / SIZE * 2 - 1) * 0.13
-    rays = (ahead + u[None, :, None] * right - u[:, None, None] * up).reshape(-1, 3)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    count, flat = len(rays), np.ascontiguousarray(rays).ravel()
-    geom, distance, normal = np.full(count, -1, np.int32), np.zeros(count), np.zeros(3 * count)
-    seen = np.array([1, 1, 1, 1, 0, 0], np.uint8)
-    mujoco.mj_multiRay(model, data, eye, flat, seen, True, -1, geom, distance, normal, count, 10.0)
+    rng, own = np.random.default_rng([_VIEW, *world.key]), np.random.default_rng([_VIEW, world.key[0]])
+    eye, rays = np.array([0.0, -0.13, 0.1]), rays_of(np.array([0.0, 0.13, -0.095]), SIZE, 0.13)
+    geom, distance, normal = cast(world, eye, rays, np.array([1, 1, 1, 1, 0, 0], np.uint8))
     table, block, shroud, palm, wall = own.uniform(0.1, 0.9, (5, 3))
     colours = np.array([table, *[block] * 4, shroud, palm, palm, wall])[geom]
     lamp = rng.normal((0.2, -0.4, 1.0), 0.3)
-    facing = np.clip(normal.reshape(-1, 3) @ (lamp / np.linalg.norm(lamp)), 0, 1)
+    facing = np.clip(normal @ (lamp / np.linalg.norm(lamp)), 0, 1)
     light = np.where(geom >= 0, rng.uniform(0.2, 0.5) + 0.7 * facing, 1.0)
     # A slot is dark: its walls and floor below the block's top get less light with their depth.
     height = eye[2] + rays[:, 2] * distance
     light *= np.where(np.isin(geom, range(5)) & (height < -1e-4) & (height > -0.0199), np.exp(height / 0.006), 1.0)
-    noise = np.random.default_rng([_VIEW, *key]).normal(0, 2.0, (count, 3))
+    noise = np.random.default_rng([_VIEW, *world.key, world.steps]).normal(0, 2.0, rays.shape)
     levels = 255 * np.clip(colours * light[:, None], 0, 1) ** (1 / 2.2) + noise
     return np.clip(levels, 0, 255).astype(np.uint8).reshape(SIZE, SIZE, 3)
 

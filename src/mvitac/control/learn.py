@@ -1,7 +1,7 @@
 """What learns from images in a closed loop: ridge on frozen features or pixels, and a trunk trained along with its head."""
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -61,16 +61,14 @@ def blind(images: dict[str, np.ndarray], targets: np.ndarray, num_val: int) -> E
 def trained(model: Model, steps: int) -> Learn:
     """Train a copy of ``model`` for each sense and one linear head, by smooth L1 on standardised targets."""
 
-    def tensors(images: Sequence[np.ndarray]) -> list[Tensor]:
-        return [torch.from_numpy(x).permute(0, 3, 1, 2) for x in images]
-
     def learn(images: dict[str, np.ndarray], targets: np.ndarray, num_val: int) -> Estimate:
         mean, std = targets.mean(0), targets.std(0) + 1e-9
         trunks = nn.ModuleDict({sense: copy.deepcopy(model) for sense in images}).train()
-        x, y = tensors(list(images.values())), torch.from_numpy((targets - mean) / std).float()
+        y = torch.from_numpy((targets - mean) / std).float()
 
-        def features(given: Sequence[Tensor]) -> Tensor:
-            return torch.cat([trunk(**{m: each})[m] for (m, trunk), each in zip(trunks.items(), given, strict=True)], 1)
+        def features(look: Look) -> Tensor:
+            seen = {m: torch.from_numpy(look(m)).permute(0, 3, 1, 2) for m in trunks}
+            return torch.cat([trunk(**{m: seen[m]})[m] for m, trunk in trunks.items()], 1)
 
         with torch.random.fork_rng():
             torch.manual_seed(0)
@@ -79,8 +77,8 @@ def trained(model: Model, steps: int) -> Learn:
             optimiser = torch.optim.AdamW(learned, weight_decay=0.05)
             schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=steps)
             for _ in range(steps):
-                rows = torch.randint(len(y), (64,))
-                loss = nn.functional.smooth_l1_loss(head(features([each[rows] for each in x])), y[rows])
+                rows = torch.randint(len(y), (64,)).numpy()
+                loss = nn.functional.smooth_l1_loss(head(features(lambda m, rows=rows: images[m][rows])), y[rows])
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()
@@ -89,7 +87,7 @@ def trained(model: Model, steps: int) -> Learn:
 
         @torch.no_grad()
         def estimate(look: Look) -> np.ndarray:
-            return head(features(tensors([look(each) for each in images]))).numpy() * std + mean
+            return head(features(look)).numpy() * std + mean
 
         return estimate
 

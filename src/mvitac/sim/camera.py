@@ -9,6 +9,7 @@ Shapes: P rays (pixels times samples). Colours are linear RGB in [0, 1] until th
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -108,7 +109,7 @@ def photograph(bench: Bench, view: View, rng: np.random.Generator, *, size: int)
     poses = view.clutter_poses
     bench.data.mocap_pos[:], bench.data.mocap_quat[:] = poses[:, :3], poses[:, 3:]
     mujoco.mj_kinematics(bench.model, bench.data)
-    rays = _rays(view, size * SAMPLES)
+    rays = rays_of(view.target - view.position, size * SAMPLES, view.half_fov, view.roll)
     geom, distance, normal = cast(bench, view.position, rays)
     points = view.position + rays * distance[:, None]
     hit = geom >= 0
@@ -132,25 +133,26 @@ def photograph(bench: Bench, view: View, rng: np.random.Generator, *, size: int)
     return np.clip(levels, 0, 255).astype(np.uint8)
 
 
-def _rays(view: View, side: int) -> np.ndarray:
-    """Return unit directions [side * side, 3], row by row from the top left."""
-    ahead = view.target - view.position
-    ahead /= np.linalg.norm(ahead)
+def rays_of(ahead: np.ndarray, side: int, half_fov: float, roll: float = 0.0) -> np.ndarray:
+    """Return unit directions [side * side, 3] around ``ahead``, row by row from the top left."""
+    ahead = ahead / np.linalg.norm(ahead)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     up = np.cross(right, ahead)
-    cos, sin = np.cos(view.roll), np.sin(view.roll)
+    cos, sin = np.cos(roll), np.sin(roll)
     right, up = cos * right + sin * up, cos * up - sin * right
-    u = ((np.arange(side) + 0.5) / side * 2 - 1) * view.half_fov
-    rays = ahead + u[None, :, None] * right - u[:, None, None] * up
-    rays = rays.reshape(-1, 3)
+    u = ((np.arange(side) + 0.5) / side * 2 - 1) * half_fov
+    rays = (ahead + u[None, :, None] * right - u[:, None, None] * up).reshape(-1, 3)
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
 def cast(
-    bench: Bench, origin: np.ndarray, rays: np.ndarray, groups: np.ndarray = VISIBLE
+    bench: Any, origin: np.ndarray, rays: np.ndarray, groups: np.ndarray = VISIBLE
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return geom [P] (-1: none), distance [P] (0 if none) and normal [P, 3] of the first hit of each ray."""
+    """Return geom [P] (-1: none), distance [P] (0 if none) and normal [P, 3] of the first hit of each ray.
+
+    ``bench`` has MuJoCo's ``model`` and ``data``.
+    """
     count, flat = len(rays), np.ascontiguousarray(rays).ravel()
     geom, distance, normal = np.full(count, -1, np.int32), np.zeros(count), np.zeros(3 * count)
     scene = bench.model, bench.data
