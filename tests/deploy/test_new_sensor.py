@@ -181,6 +181,7 @@ def test_live_says_which_sensor_is_new(engine: Engine) -> None:
         return about_sensor(SimpleNamespace(**{**given, **about}), name)
 
     assert "slim is new to the model, which knows digit, mini: nothing is done" in said("slim")
+    assert said("slim", sensors=[]).endswith("slim may be new to it") and "met the touch sensors digit" in said("")
     assert said("mini") == said("", sensors=[]) == said("slim", inputs={"vision": (32, 32, 3)}) == ""
     for name in ("", "slim"):
         assert "slim is new to the model: it is shown in the colours of" in about_sensor(engine, name)

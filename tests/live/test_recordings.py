@@ -158,7 +158,7 @@ def test_predict_command(
         (): "give one SOURCE",
         (str(films["touch"]), *both): "give one SOURCE",
         (str(films["touch"]),): "takes vision and touch",
-        tuple(both[2:]): "the model takes channels",
+        tuple(both[2:]): "the model takes {'vision': 1, 'touch': 1}",
         ("--vision", "0", *both[2:]): "give a video",
     }
     for words, says in wrong.items():

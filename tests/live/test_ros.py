@@ -37,6 +37,10 @@ def carried(message: Any) -> Any:
     return STORE.deserialize_cdr(STORE.serialize_cdr(message, kind), kind)
 
 
+class ExternalShutdown(Exception):
+    pass
+
+
 class Robot:
     """A ROS in which a camera and a gel publish at 100 Hz: touched from 1.0 to 1.6 s, then silent, then without encoding."""
 
@@ -50,7 +54,8 @@ class Robot:
             publish=lambda message: self.sent[topic].append(carried(message))
         )
         self.rclpy = MagicMock(create_node=lambda name: self.ros, spin=self.spin)
-        modules = {"rclpy": self.rclpy, "rclpy.qos": self.rclpy.qos}
+        self.rclpy.executors.ExternalShutdownException = ExternalShutdown
+        modules = {"rclpy": self.rclpy, "rclpy.qos": self.rclpy.qos, "rclpy.executors": self.rclpy.executors}
         for name, module in (modules | {"sensor_msgs.msg": SENSOR_MSGS, "std_msgs.msg": STD_MSGS}).items():
             monkeypatch.setitem(sys.modules, name, module)
 
@@ -75,6 +80,7 @@ class Robot:
         tick()
         put[TOUCH][1](replace(messages[TOUCH], encoding="yuv422"))
         put[TOUCH][1](messages[TOUCH])
+        raise ExternalShutdown  # as rclpy does at Ctrl-C
 
 
 @pytest.mark.parametrize("always", [False, True])
@@ -83,6 +89,7 @@ def test_it_answers_at_its_rate_under_the_time_of_the_images(
 ) -> None:
     robot = Robot(monkeypatch, export=str(onnx), vision=VISION, touch=TOUCH, rate=50.0, always=always)
     load_node().main()
+    robot.rclpy.try_shutdown.assert_called_once()
     assert robot.ros.create_timer.call_args.args[0] == 1 / 50
     assert robot.rclpy.qos.QoSProfile.call_args.kwargs["depth"] == 1  # a queue would hand over old frames as new ones
     *said, last = (json.loads(message.data) for message in robot.sent["~/prediction"])
@@ -112,7 +119,7 @@ def test_it_answers_at_its_rate_under_the_time_of_the_images(
 
 def test_topics_that_the_model_does_not_take(onnx: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Robot(monkeypatch, export=str(onnx), vision=VISION)
-    with pytest.raises(ValueError, match="the model takes channels"):
+    with pytest.raises(ValueError, match=r"the model takes \{'vision': 1, 'touch': 1\}"):
         load_node().main()
 
 

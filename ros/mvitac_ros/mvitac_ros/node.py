@@ -6,6 +6,7 @@ Only ``main`` needs ROS. Parameters, topics and messages are described in docs/p
 """
 
 import array
+import contextlib
 import io
 import json
 from collections.abc import Callable, Sequence
@@ -89,6 +90,7 @@ class Node:
 
 def main() -> None:
     import rclpy  # pyright: ignore[reportMissingImports]
+    from rclpy.executors import ExternalShutdownException  # pyright: ignore[reportMissingImports]
     from rclpy.qos import QoSProfile, ReliabilityPolicy  # pyright: ignore[reportMissingImports]
     from sensor_msgs.msg import CompressedImage, Image  # pyright: ignore[reportMissingImports]
     from std_msgs.msg import String  # pyright: ignore[reportMissingImports]
@@ -128,11 +130,9 @@ def main() -> None:
             kind = CompressedImage if topic.endswith("/compressed") else Image
             ros.create_subscription(kind, topic, lambda m, of=(modality, which): node.image(*of, m), newest)
     ros.create_timer(1 / parameter("rate", 30.0), node.tick)
-    try:
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):  # Ctrl-C, or the end of a launch
         rclpy.spin(ros)
-    finally:
-        ros.destroy_node()
-        rclpy.shutdown()
+    rclpy.try_shutdown()  # a signal may have done it
 
 
 if __name__ == "__main__":

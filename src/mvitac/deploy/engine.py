@@ -127,12 +127,12 @@ def about_sensor(engine: Any, name: str) -> str:
     if new:
         colours = f"{listed(new['in_colours_of'])} ({new['num_images']} unlabelled images)"
         return f"touch sensor {new['sensor']} is new to the model: it is shown in the colours of {colours}"
-    if not name and known:
+    if not known:
+        return f"nothing says which touch sensors the model met: {name} may be new to it" if name else ""
+    if not name:
         return f"the model met the touch sensors {listed(known)}: --sensor NAME says if another is used"
-    if not name or name in known:
-        return ""
     how = "nothing is done about it (`mvitac export MODEL --new-sensor RECORDING` shows it in their colours)"
-    return f"touch sensor {name} is new to the model, which knows {listed(known) or 'it is not said which'}: {how}"
+    return "" if name in known else f"touch sensor {name} is new to the model, which knows {listed(known)}: {how}"
 
 
 def frames_of(window: Mapping[str, Any] | None, modality: str) -> int:

@@ -46,7 +46,7 @@ class Source(ABC):
         left, top, width, height = self.crop
         part = image[top : top + height, left : left + width]
         if part.shape[:2] != (height, width):
-            raise ValueError(f"crop {':'.join(map(str, self.crop))} is larger than {image.shape[1]} x {image.shape[0]}")
+            raise ValueError(f"crop {':'.join(map(str, self.crop))} reaches beyond {image.shape[1]} x {image.shape[0]}")
         return part
 
 

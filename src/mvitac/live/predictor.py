@@ -84,11 +84,11 @@ class Live:
             always: predict from every frame; without contact, an answer is that of its frame alone.
 
         Raises:
-            ValueError: the engine takes other inputs, or differences that live input does not have.
+            ValueError: the engine takes other inputs, or other backgrounds subtracted than those that can be learned live.
         """
-        given = {m: 3 * len(several) for m, several in streams.items()}
-        if given != (wanted := {m: shape[2] for m, shape in frame_shapes(engine).items()}):
-            raise ValueError(f"the model takes channels {wanted}, the sources have {given}")
+        given = {m: len(several) for m, several in streams.items()}
+        if given != (wanted := {m: shape[2] // 3 for m, shape in frame_shapes(engine).items()}):
+            raise ValueError(f"number of sources: the model takes {wanted}, given are {given}")
         self.engine, self.streams, self.config, self.clock = engine, streams, config, clock
         self.record, self.tell, self.always = record, tell, always
         self.all = [s for several in streams.values() for s in several]

@@ -36,7 +36,7 @@ class TouchAndGoConfig(DatasetConfig):
     rough/smooth. Download the recordings from touch-and-go.github.io and the four list files from the owners' repository.
     To pack everything:
 
-    mvitac data pack --data touch-and-go --data.root DOWNLOAD --data.lists LISTS --out packs/tag
+    mvitac data pack --data touch-and-go --root DOWNLOAD --lists LISTS --out packs/tag
     """
 
     name: ClassVar[str] = "touch-and-go"
