@@ -158,16 +158,18 @@ def test_usual_names_need_no_option(tmp_path: Path) -> None:
 
 
 def test_groups_inside_each_other(tmp_path: Path) -> None:
-    """Links back up are not followed, a second name is not a second recording, and 3,000 levels are read in seconds."""
+    """Links are not followed, a second name is not a second recording, and 3,000 levels are read in seconds."""
+    other = write(tmp_path / "other.h5", {"touch": grays(1, 2)})
     with h5py.File(tmp_path / "deep.h5", "w") as file:
         group = file
         for _ in range(3000):
             group = group.create_group("g")
         group["touch"] = np.zeros((4, 8, 8, 3), np.uint8)
-        group["up"], group["same"], file["again"] = file, h5py.SoftLink("."), group
+        group["up"], group["same"], file["second"] = file, h5py.SoftLink("nowhere"), group
+        file["a"] = h5py.ExternalLink(str(other), "/")
     start = time.monotonic()
     table = read_arrays(tmp_path / "deep.h5", [tmp_path / "deep.h5"], (), ())
-    assert [row["demo"] for row in table.rows] == ["again"] * 4 and time.monotonic() - start < 30
+    assert [row["demo"] for row in table.rows] == ["/".join(["g"] * 3000)] * 4 and time.monotonic() - start < 10
 
 
 def test_what_a_demonstration_lacks(tmp_path: Path) -> None:
@@ -428,7 +430,6 @@ ZARR: dict[str, tuple[Callable[[Path], object], str]] = {
     "pickles": (claimed("data/gel", dtype="|O", filters=[{"id": "pickle"}]), "cannot be read as zarr .*pickle"),
     "chunks of nothing": (claimed("data/gel", chunks=[0, 16, 16, 3]), "/data/gel row 0 cannot be read .*by zero"),
     "no end of ends": (claimed(ENDS, shape=[10**12], chunks=[10**12]), TO_20),
-    "ends of floats": (claimed(ENDS, dtype="<f8"), TO_20),
     "ends of ends": (claimed(ENDS, shape=[2, 1], chunks=[2, 1]), TO_20),
     "a negative end": (lambda path: zarr.open_group(path)[ENDS].__setitem__(0, -8), TO_20),
 }

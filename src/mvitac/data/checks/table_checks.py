@@ -197,7 +197,7 @@ def give_aways(pack: Pack) -> Finding:
                 continue
             part = np.searchsorted(np.unique(np.quantile(mine, np.arange(1, 8) / 8)), mine)
             notes += _predicts(name, task.name, part, labels)
-    advice = "report them with every score as a control (--data.controls name=column)"
+    advice = "report them with every score as a control (--controls name=column)"
     evidence = "; ".join(notes) or "no column of numbers does"
     return judged("columns that give a label away", evidence, advice, look=bool(notes))
 

@@ -110,7 +110,7 @@ def _episodes(demo: str, ends: Any, num: int) -> list[tuple[str, int]]:
     """Return the episode of each row and the row's place in it; without ``ends``, the demonstration is one."""
     if ends is None:
         return [(demo, i) for i in range(num)]
-    whole = ends.ndim == 1 and 0 < ends.size <= num and ends.dtype.kind in "iu"
+    whole = ends.ndim == 1 and 0 < ends.size <= num
     starts = np.r_[0, np.asarray(ends[...], np.int64)] if whole else np.zeros(1)
     if starts[-1] != num or (np.diff(starts) <= 0).any():
         raise ValueError(f"{demo}: meta/episode_ends does not rise to {num}, the number of images")
