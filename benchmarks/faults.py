@@ -45,8 +45,7 @@ from mvitac.cli.main import main as mvitac
 from mvitac.data.pack import Pack
 from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import FILE, read_sources
-from mvitac.model import safetensors_digest
-from mvitac.model_files import load
+from mvitac.model import load, safetensors_digest
 from mvitac.run import load_run
 from mvitac.system.files import read_json
 from mvitac.training import checkpoint

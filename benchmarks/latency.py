@@ -29,7 +29,7 @@ from mvitac.deploy.engine import Call, Engine, Runtime, cosines
 from mvitac.deploy.export import export
 from mvitac.deploy.export_config import ExportConfig, Precision
 from mvitac.deploy.export_module import ExportModule
-from mvitac.model_files import fresh
+from mvitac.model import fresh
 from mvitac.nn.encoders import Encoders
 from mvitac.recipes import recipe
 from mvitac.system.provenance import provenance

@@ -24,7 +24,7 @@ from mvitac.evaluation.intervals import interval
 from mvitac.evaluation.probe import probe_features, split_rows
 from mvitac.evaluation.score_text import percent, with_interval
 from mvitac.evaluation.scores import pool
-from mvitac.model_files import fresh
+from mvitac.model import fresh
 from mvitac.nn.encoders import Encoders
 from mvitac.recipes import recipe
 

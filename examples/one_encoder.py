@@ -31,8 +31,7 @@ from mvitac.evaluation.intervals import interval, paired_difference
 from mvitac.evaluation.probe import probe_features, split_rows
 from mvitac.evaluation.score_text import percent, with_interval
 from mvitac.evaluation.scores import pool
-from mvitac.model import Model
-from mvitac.model_files import fresh
+from mvitac.model import Model, fresh
 from mvitac.recipes import recipe
 from mvitac.system.files import read_json, write_json
 

@@ -29,7 +29,7 @@ def main(runs: list[str]) -> None:
         rows = split_rows(pack, task, "touch").test
         z = torch.from_numpy(features(model, pack, "touch", rows, for_heads=True))
         values = pack.values(task)[rows]
-        errors.append(model.estimate("same", {"touch": z}).numpy() - values)
+        errors.append(model.answer("same", {"touch": z}).numpy() - values)
     squared, absolute = np.mean(np.square(errors), axis=0), np.mean(np.abs(errors), axis=0)  # over runs
     print("R2, then mean absolute error, of", ", ".join(target.name for target in task.targets))
     for low, high in (*DEPTHS, (0.0, np.inf)):

@@ -33,8 +33,7 @@ from mvitac.deploy.policy import ObservationEncoder
 from mvitac.evaluation.classifiers import fit_linear
 from mvitac.evaluation.intervals import interval, paired_difference
 from mvitac.evaluation.probe import ProbeSplit, split_rows
-from mvitac.model import Model
-from mvitac.model_files import fresh
+from mvitac.model import Model, fresh
 from mvitac.nn.encoders import SCRATCH
 from mvitac.system.files import check_place, write_json
 

@@ -16,8 +16,7 @@ import torch
 import mvitac
 from mvitac.evaluation.controls import borders, thumbnails
 from mvitac.evaluation.diagnostics import linear_probe
-from mvitac.model import Model
-from mvitac.model_files import fresh
+from mvitac.model import Model, fresh
 
 EDGE = 9  # pixels of 72: the border of ``controls.borders``
 

@@ -18,8 +18,7 @@ from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.features import pack_features
 from mvitac.methods.calandra import CalandraConfig
-from mvitac.model import Model
-from mvitac.model_files import fresh
+from mvitac.model import Model, fresh
 from mvitac.recipes import recipe
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD, plain_view
 from support.toy import toy_pack

@@ -8,8 +8,9 @@ Shapes: N or B images, C channels, H x W pixels, D features, E dimensions of the
 """
 
 import json
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -19,13 +20,16 @@ from mvitac.data.spec import DataSpec, Target, listed
 from mvitac.methods.base import Method
 from mvitac.nn.encoders import num_features, timm_trunk
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
-from mvitac.nn.weights import safetensors_digest, write_model
-from mvitac.registry import to_json, unknown
+from mvitac.nn.weights import misfit, read_model, safetensors_digest, write_model
+from mvitac.registry import from_json, to_json
 from mvitac.run import Run
-from mvitac.system.files import digest
+from mvitac.system.files import brief, digest, parse_json
 from mvitac.transforms.preprocess import ImageInput, Preprocess, check_images, encoder_input, resized, to_array
 
 ABOUT = ("run", "spec", "stored")  # texts in the header of a file of weights
+MAX_STORED = 1024  # px: no pack holds larger images (``data.storage``)
+BEST = "model.best.safetensors"  # weights of a run that were best on split val, kept with ``Run.eval_every``
+Which = Literal["last", "best"]
 EMBED_BATCH = 64  # images that ``Model.embed`` passes through an encoder at once: 0.5 GB with ResNet-18 at 224 px
 
 
@@ -67,10 +71,6 @@ class Model(nn.Module):
     def seed(self) -> int:
         return self.run.seed
 
-    @property
-    def title(self) -> str:
-        return self.run.method.name
-
     def sides(self, modality: str) -> tuple[int, int]:
         """Sides in pixels of the images that probes, and heads trained along, see."""
         return self.run.augment.whole_of(modality), self.run.augment.size_of(modality)
@@ -91,7 +91,7 @@ class Model(nn.Module):
         return f"Model({method} of {trunk}, trained on {self.spec.name}{sensors}: features {widths})"
 
     def forward(
-        self, *unnamed: Tensor, vision: Tensor | None = None, touch: Tensor | None = None, shared: bool = False
+        self, *, vision: Tensor | None = None, touch: Tensor | None = None, shared: bool = False
     ) -> dict[str, Tensor]:
         """Features of batches of images, with gradients, for fine-tuning.
 
@@ -99,7 +99,6 @@ class Model(nn.Module):
         ``train()`` changes that, as for any torch module.
 
         Args:
-            unnamed: Not allowed: images need the name of their modality.
             vision: Camera images [B, C, H, W], uint8 or float in [0, 1], e.g. a batch of ``transform("vision")``.
             touch: Tactile images, likewise. For models trained on difference images: the differences.
             shared: Return embeddings in the space shared by both modalities, L2-normalised, instead of features.
@@ -110,17 +109,15 @@ class Model(nn.Module):
         Raises:
             ValueError: If images do not fit the model.
         """
-        if unnamed:
-            raise ValueError(f"images need a name: {' or '.join(f'model({m}=images)' for m in self.encoders)}")
         result = {}
-        for modality, images in self._named(vision, touch).items():
+        for modality, images in self._named(vision=vision, touch=touch).items():
             check_images(images, self.spec.channels(modality), modality)
             features = self._encode(modality, resized(images, self.stored), shared)
             result[modality] = self._project(modality, features) if shared else features
         return result
 
-    def _named(self, vision: Any, touch: Any) -> dict[str, Any]:
-        given = {m: v for m, v in (("vision", vision), ("touch", touch)) if v is not None}
+    def _named(self, **images: Any) -> dict[str, Any]:
+        given = {modality: value for modality, value in images.items() if value is not None}
         if not given:
             raise ValueError("no images given: give vision=..., touch=..., or both")
         for modality in given:
@@ -179,7 +176,7 @@ class Model(nn.Module):
         Args:
             modality: vision or touch.
             images: uint8 [B, C, H, W], as a pack stores them, or floats in [0, 1].
-            for_heads: Compute the features that ``project`` and ``classify`` take. They see images at the size of the
+            for_heads: Compute the features that ``project`` and ``answer`` take. They see images at the size of the
                 training views (``Augment.size``), while probes see them at ``Augment.whole``.
             bf16: Compute in bf16.
 
@@ -196,30 +193,16 @@ class Model(nn.Module):
         return self._project(modality, features)
 
     @torch.no_grad()
-    def classify(self, task: str, features: dict[str, Tensor]) -> Tensor:
-        """Class probabilities [B, K] from the classifier that a supervised method trained with its encoders.
+    def answer(self, task: str, features: dict[str, Tensor]) -> Tensor:
+        """Class probabilities [B, K], or values [B, T] in their units, from a head trained along by a supervised method.
 
         Args:
-            task: One of ``tasks``, with classes.
+            task: One of ``tasks``.
             features: modality -> ``features(..., for_heads=True)``.
         """
-        return self._answer(task, features).softmax(dim=1)
-
-    @torch.no_grad()
-    def estimate(self, task: str, features: dict[str, Tensor]) -> Tensor:
-        """Values [B, T] in their units, from the head that a supervised method trained with its encoders.
-
-        Args:
-            task: One of ``tasks``, with values.
-            features: modality -> ``features(..., for_heads=True)``.
-        """
-        return self._answer(task, features)
-
-    def _answer(self, task: str, features: dict[str, Tensor]) -> Tensor:
-        if task not in self.tasks:
-            raise unknown("task of this model's own heads", task, self.tasks or ("none",))
-        joined = torch.cat([features[m] for m in self.encoders], dim=1)
-        return self.classifiers[self.tasks.index(task)](joined)
+        head = self.classifiers[self.tasks.index(task)]
+        found = head(torch.cat([features[m] for m in self.encoders], dim=1))
+        return found.softmax(dim=1) if task in {task.name for task in self.spec.tasks} else found
 
     def embed(
         self,
@@ -258,30 +241,31 @@ class Model(nn.Module):
         """
         if self.training:
             raise ValueError("the model is in training mode, which would change BatchNorm: call model.eval() first")
-        given = self._named(vision, touch)
+        given = self._named(vision=vision, touch=touch)
         self._check_background("touch" if touch is not None else "vision", background)
-        return {m: self._embed(m, v, background if m == "touch" else None, shared) for m, v in given.items()}
-
-    def _embed(self, modality: str, value: ImageInput, background: ImageInput | None, shared: bool) -> Tensor:
-        prepare = self.transform(modality)
-        chunks = []
-        for batch in prepare.batches(value, background, EMBED_BATCH):
-            features = self.features(modality, batch.to(next(self.parameters()).device), for_heads=shared)
-            chunks.append(self.project(modality, features) if shared else features)
-        return torch.cat(chunks)
+        device, found = next(self.parameters()).device, {}
+        for modality, value in given.items():
+            chunks = []
+            for batch in self.transform(modality).batches(
+                value, background if modality == "touch" else None, EMBED_BATCH
+            ):
+                features = self.features(modality, batch.to(device), for_heads=shared)
+                chunks.append(self.project(modality, features) if shared else features)
+            found[modality] = torch.cat(chunks)
+        return found
 
     def _check_background(self, modality: str, background: ImageInput | None) -> None:
         if background is None:
             return
-        first = self.spec.window.minus_first and "touch" in self.spec.window.of
-        if first and self.spec.difference:
-            what = "this model's touch is minus a background, then minus its first frame"
-            raise ValueError(f"background: {what}: give it as trained")
+        first, why = self.spec.window.minus_first and "touch" in self.spec.window.of, ""
         if modality != "touch":
-            raise ValueError("background cannot be used, there is no touch: leave it out")
-        if not (self.spec.difference or first):
-            untrained = "this model was not trained on difference images of touch"
-            raise ValueError(f"background cannot be used, {untrained}: leave it out")
+            why = "there is no touch"
+        elif first and self.spec.difference:
+            why = "this model's touch is minus a background, then minus its first frame"
+        elif not (self.spec.difference or first):
+            why = "this model was not trained on difference images of touch"
+        if why:
+            raise ValueError(f"background cannot be used, {why}: leave it out")
 
     def predict(
         self, *, vision: ImageInput | None = None, touch: ImageInput | None = None, background: ImageInput | None = None
@@ -302,7 +286,7 @@ class Model(nn.Module):
         """
         given = self.embed(vision=vision, touch=touch, background=background)
         asked = "both" if len(given) == 2 else next(iter(given))
-        if len({len(x) for x in given.values()}) > 1:
+        if len({*map(len, given.values())}) > 1:
             raise ValueError(f"predict: got {len(given['vision'])} vision and {len(given['touch'])} touch images")
         chosen = [r for r in self.probes.values() if r.info.modality == asked]
         if not chosen:
@@ -327,23 +311,75 @@ class Model(nn.Module):
 
     def weights_digest(self) -> str:
         """Content address of the weights and of the image size they expect, for caches."""
-        tensors = {name: t.cpu().contiguous() for name, t in self.state_dict().items()}
-        return digest([safetensors_digest(tensors), *dict.fromkeys(self.sides(m)[0] for m in self.encoders)])
+        return digest([safetensors_digest(tensors_of(self)), *dict.fromkeys(self.sides(m)[0] for m in self.encoders)])
 
     def features_key(self, modality: str) -> str:
         """Content address of what the features of ``modality`` depend on. Models that share a tower share it."""
-        tensors = {name: t.cpu().contiguous() for name, t in self.encoders[modality].state_dict().items()}
         encoder = self.run.encoder[modality]
         kind = encoder.trunk, encoder.temporal, self.levels(modality), self.sides(modality)[0], self.stored
-        return digest([safetensors_digest(tensors), *kind])
+        return digest([safetensors_digest(tensors_of(self.encoders[modality])), *kind])
 
     def save(self, path: Path, *, half: bool = False) -> None:
         """Write a .safetensors file with the run and the description of the data in its header.
 
         ``half``: kernels and matrices in fp16, which halves the file. They are fp32 again once loaded.
         """
-        tensors = {name: t.cpu().contiguous() for name, t in self.state_dict().items()}
+        tensors = tensors_of(self)
         if half:
             tensors = {name: t.half() if t.ndim > 1 else t for name, t in tensors.items()}
         about = json.dumps(to_json(self.run)), json.dumps(to_json(self.spec)), str(self.stored)
         write_model(path, tensors, dict(zip(ABOUT, about, strict=True)))
+
+
+def tensors_of(network: nn.Module) -> dict[str, Tensor]:
+    """The state dict of ``network``, on the CPU."""
+    return {name: tensor.cpu().contiguous() for name, tensor in network.state_dict().items()}
+
+
+def weights_file(folder: Path, which: Which) -> Path:
+    """The file of a run's weights; ValueError if the best ones were not kept."""
+    if which == "best" and not (folder / BEST).is_file():
+        raise ValueError(f"{folder} has no {BEST}: train with --eval-every N to keep the best weights, or use the last")
+    return folder / (BEST if which == "best" else "model.safetensors")
+
+
+def fresh(run: Run, spec: DataSpec, stored: int) -> Model:
+    """The model of ``run`` before training, initialised from its seed. Used as a control, and to load weights into."""
+    torch.manual_seed(run.seed)
+    return Model(run.method.build(spec, run.encoder), run, spec, stored)
+
+
+def load(path: str | Path, which: Which = "last") -> Model:
+    """Load a trained model from the folder of a run or from its model.safetensors. Never unpickles.
+
+    ``which`` weights of a folder: those after its last step, or the best on split val (``Run.eval_every``). ValueError if
+    there is no such model, or the file is damaged or was changed.
+    """
+    path = Path(path)
+    file = weights_file(path, which) if path.is_dir() else path
+    if not file.is_file():
+        hint = "; the run is not finished: `mvitac pretrain --resume`" if (path / "checkpoint.pt").exists() else ""
+        raise ValueError(f"no trained model at {file}{hint}")
+    header, tensors = read_model(file, ABOUT)
+    try:
+        run = Run.load(parse_json(header["run"]))
+        spec: DataSpec = from_json(DataSpec, parse_json(header["spec"]), "spec")
+        stored = int(from_json(int, parse_json(header["stored"]), "stored"))
+        if not 1 <= stored <= MAX_STORED:
+            raise ValueError(f"stored {stored}: expected 1 to {MAX_STORED} px")
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{file} has a damaged header ({brief(error)}): copy it again or re-train") from None
+    # The file has all weights, so the empty model needs no pretrained ones, and no download.
+    empty = run.fresh()
+    # Check shapes before allocating: a damaged header may describe a network larger than the memory.
+    with torch.random.fork_rng(devices=[]):  # keep the caller's random state
+        with torch.device("meta"):
+            if why := misfit(fresh(empty, spec, stored).state_dict(), tensors):
+                raise ValueError(f"{file} holds other weights than its run describes: {why}")
+        model = fresh(empty, spec, stored)
+    model.foreign = (file.parent / "artifact.json").exists()
+    if model.foreign and run.init:
+        run = replace(run, init=replace(run.init, path=None, digest=run.init.digest or "unknown"))
+    model.run = run
+    model.load_state_dict(tensors)
+    return model

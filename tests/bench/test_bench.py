@@ -24,7 +24,7 @@ from mvitac.data.pack import Pack
 from mvitac.deploy.artifact import load
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import features
-from mvitac.model_files import fresh
+from mvitac.model import fresh
 from mvitac.system.files import digest
 from support.forged_packs import Change, put
 from support.pages import drawings

@@ -29,7 +29,7 @@ from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import features
 from mvitac.evaluation.probe import probe_model
 from mvitac.evaluation.retrieval import cross_modal
-from mvitac.model_files import fresh
+from mvitac.model import fresh
 from mvitac.recipes import recipe
 from support.owners import OWNERS, tvl
 from support.toy import toy_pack

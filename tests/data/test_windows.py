@@ -19,7 +19,7 @@ from mvitac.data.spec import DataSpec, Task, Window
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
-from mvitac.model_files import load
+from mvitac.model import load
 from mvitac.nn.encoders import EncoderConfig, PerFrame, build_trunk
 from mvitac.recipes import recipe
 from mvitac.training.loop import train

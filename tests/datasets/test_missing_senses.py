@@ -20,8 +20,7 @@ from mvitac.deploy.publish import fit_probes
 from mvitac.evaluation import sensors
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.probe import split_rows
-from mvitac.model import Model
-from mvitac.model_files import load
+from mvitac.model import Model, load
 from mvitac.recipes import recipe
 from mvitac.report.explorer_data import ExplorerData
 from mvitac.training.loop import train

@@ -31,8 +31,7 @@ from mvitac.live.contact import LiveConfig
 from mvitac.live.predictor import Live
 from mvitac.live.recorder import Recorder
 from mvitac.live.streams import Stream
-from mvitac.model import Model
-from mvitac.model_files import load
+from mvitac.model import Model, load
 from mvitac.recipes import recipe
 from mvitac.sim import materials
 from mvitac.sim.sensors import SENSORS

@@ -13,7 +13,7 @@ from mvitac.data.source import Sample
 from mvitac.data.spec import DataSpec
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import Grasps, GraspsConfig
-from mvitac.model_files import fresh
+from mvitac.model import fresh
 from mvitac.recipes import recipe
 from support.examples import load_example
 

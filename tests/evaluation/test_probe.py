@@ -34,7 +34,7 @@ from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.run_names import names_of
 from mvitac.evaluation.score_text import verdicts
 from mvitac.methods.supervised import SupervisedConfig
-from mvitac.model_files import fresh, load
+from mvitac.model import fresh, load
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders
 from mvitac.recipes import recipe, with_method
 from mvitac.report.report import open_runs

@@ -27,8 +27,7 @@ from mvitac.evaluation.sensors import (
     touch_features,
     unlabelled_rows,
 )
-from mvitac.model import Model
-from mvitac.model_files import load
+from mvitac.model import Model, load
 from mvitac.nn.initial import Init
 from mvitac.recipes import recipe
 from mvitac.run import load_run

@@ -26,7 +26,7 @@ from mvitac.evaluation.leaks import UNKNOWN
 from mvitac.evaluation.probe import probe_model
 from mvitac.experiments.adapt import NEW, OLD, Adaptation, adapt
 from mvitac.experiments.finetune import FROZEN, SCRATCH, Finetuning, _start, finetune
-from mvitac.model_files import load
+from mvitac.model import load
 from mvitac.nn.encoders import EncoderConfig
 from mvitac.report.tables import print_finetuning
 from mvitac.run import load_run

@@ -22,7 +22,7 @@ from mvitac.methods.moco import MoCo, MoCoConfig
 from mvitac.methods.simclr import nt_xent
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.methods.vicreg import VICReg, covariance, variance
-from mvitac.model_files import fresh, load
+from mvitac.model import fresh, load
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Queue
 from mvitac.recipes import with_method
@@ -329,7 +329,7 @@ def test_the_own_classifier_is_scored_on_views_of_the_side_it_learned_from(pack:
     task, rows = pack.spec.tasks[0], pack.rows("test")
     own = next(r for r in probe_model(model, pack, [task], ["both"], ["linear"]) if r["probe"] == "own")
     z = {m: pack_features(model, pack, m, rows, for_heads=True) for m in ("vision", "touch")}
-    right = model.classify("pattern", z).argmax(1).numpy() == pack.column("label_pattern")[rows]
+    right = model.answer("pattern", z).argmax(1).numpy() == pack.column("label_pattern")[rows]
     assert own["accuracy"] == pytest.approx(right.mean())
     assert not torch.equal(z["touch"], pack_features(model, pack, "touch", rows))
 

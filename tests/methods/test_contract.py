@@ -12,7 +12,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from mvitac.data.pack import Pack
 from mvitac.methods.base import MethodConfig, Views
-from mvitac.model_files import load
+from mvitac.model import load
 from mvitac.nn.encoders import Encoders
 from mvitac.recipes import with_method
 from mvitac.registry import default, from_json, to_json

@@ -16,7 +16,7 @@ from mvitac.evaluation.probe import probe_model, split_rows
 from mvitac.methods.base import Views
 from mvitac.methods.calandra import CalandraConfig
 from mvitac.methods.supervised import SupervisedConfig, ValueHead
-from mvitac.model_files import fresh, load
+from mvitac.model import fresh, load
 from mvitac.run import Optim
 from mvitac.training.loop import train
 from mvitac.training.views import values_of
@@ -122,7 +122,7 @@ def test_the_own_head_is_trained_and_scored_in_the_unit(measured: Pack, tmp_path
     both = measured.spec.values[1]
     rows = split_rows(measured, both).test
     z = {m: pack_features(model, measured, m, rows) for m in ("vision", "touch")}
-    guess, true = model.estimate("both", z).numpy(), measured.values(both)[rows]
+    guess, true = model.answer("both", z).numpy(), measured.values(both)[rows]
     records = probe_model(model, measured, measured.spec.all_tasks, ["both"], [])
     own = {r["task"]: r for r in records if r["probe"] == "own"}
     assert set(own) == {"pattern", "both"}  # what it learned

@@ -19,7 +19,7 @@ from mvitac.data.pack import Pack
 from mvitac.deploy.export import export
 from mvitac.deploy.publish import publish
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
-from mvitac.model_files import load
+from mvitac.model import load
 from mvitac.system import progress
 from mvitac.system.files import read_json, write_json
 from mvitac.system.locks import Busy, new_folder

@@ -21,7 +21,7 @@ from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.methods.mvitac import MViTacConfig
-from mvitac.model_files import fresh
+from mvitac.model import fresh
 from mvitac.recipes import recipe
 from mvitac.run import Optim, Run
 from mvitac.system import files

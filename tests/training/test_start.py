@@ -19,7 +19,7 @@ from mvitac.evaluation.leaks import read_sources, weights_files
 from mvitac.experiments.plan import Plan, Row
 from mvitac.methods.byol import BYOLConfig
 from mvitac.methods.mvitac import MViTacConfig
-from mvitac.model_files import fresh, load
+from mvitac.model import fresh, load
 from mvitac.nn.encoders import Encoders, PerFrame, build_trunk
 from mvitac.nn.initial import Init, load_trunk
 from mvitac.nn.momentum import Momentum

@@ -13,8 +13,7 @@ import mvitac
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import stored_result
-from mvitac.model import Model
-from mvitac.model_files import fresh
+from mvitac.model import Model, fresh
 from mvitac.registry import from_json
 from mvitac.report.report import write_report
 from mvitac.run import Optim

@@ -18,7 +18,7 @@ from typing import Any
 from huggingface_hub import ModelHubMixin
 from torch import nn
 
-from mvitac import model_files
+from mvitac import model as models
 from mvitac.deploy.sealed_folder import SealedFolder
 from mvitac.evaluation.encoders import is_encoder, open_encoder
 from mvitac.model import Model
@@ -80,7 +80,7 @@ class PublishedModel(Model, ModelHubMixin):
             shutil.copyfile(self.folder / name, save_directory / name)
 
 
-def load(path: str | Path, which: model_files.Which = "last") -> Model:
+def load(path: str | Path, which: models.Which = "last") -> Model:
     """Load a trained model, in eval mode; from an artifact with its probes (``Model.predict``).
 
     Args:
@@ -104,7 +104,7 @@ def load(path: str | Path, which: model_files.Which = "last") -> Model:
     # "runs/frist" beside a folder runs/ is a typing mistake, not a repository.
     if found and not local.exists() and not local.parent.is_dir():
         return read(pull(found["repo"], found["revision"]))
-    return read(local) if (local / ARTIFACT.name).is_file() else model_files.load(local, which)
+    return read(local) if (local / ARTIFACT.name).is_file() else models.load(local, which)
 
 
 def pull(repo: str, revision: str | None = None, **options: Any) -> Path:
@@ -139,7 +139,7 @@ def preprocessing(model: Model) -> dict[str, Any]:
 def read(folder: Path) -> PublishedModel:
     """The model in the artifact ``folder``, with its probes; ValueError if anything was changed since it was published."""
     about = ARTIFACT.read(folder)
-    model = model_files.load(folder / "model.safetensors")
+    model = models.load(folder / "model.safetensors")
     with fields_of(folder / ARTIFACT.name):
         asked, given = preprocessing(model), about["preprocessing"]
         for name in ("colour_order", "mean", "std", "stored", "size", "channels", "window"):

@@ -21,8 +21,7 @@ from mvitac.evaluation.regressors import Linear
 from mvitac.evaluation.scores import summarise
 from mvitac.evaluation.sensors import sensors_of
 from mvitac.evaluation.value_scores import error_by_range
-from mvitac.model import Model
-from mvitac.model_files import load
+from mvitac.model import Model, load
 from mvitac.nn.encoders import build_trunk
 from mvitac.nn.linear_probe import Error, LinearProbe, ProbeInfo, ValueInfo
 from mvitac.registry import to_json

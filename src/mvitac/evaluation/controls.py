@@ -25,8 +25,7 @@ from mvitac.evaluation.probe import (
 from mvitac.evaluation.probe_config import Standardise
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.methods.simclr import SimCLRConfig
-from mvitac.model import Model
-from mvitac.model_files import fresh
+from mvitac.model import Model, fresh
 from mvitac.nn import imagenet
 from mvitac.nn.encoders import IMAGENET, SCRATCH, EncoderConfig, Encoders
 from mvitac.run import Run

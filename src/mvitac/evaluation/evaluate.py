@@ -26,8 +26,7 @@ from mvitac.evaluation.run_names import names_of
 from mvitac.evaluation.score_text import columns_of, covered, score_name, score_rows, tested_on
 from mvitac.evaluation.scores import per_class, pool, summarise
 from mvitac.evaluation.sensors import about_new, describe_statistics
-from mvitac.model import Model
-from mvitac.model_files import Which, load, weights_file
+from mvitac.model import Model, Which, load, weights_file
 from mvitac.nn.encoders import build_trunk
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run, load_run

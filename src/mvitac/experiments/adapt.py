@@ -16,8 +16,7 @@ from mvitac.evaluation.features import fitting
 from mvitac.evaluation.leaks import Scored, Source, read_sources
 from mvitac.evaluation.probe import probe_model, scorable, split_rows
 from mvitac.evaluation.retrieval import cross_modal, retrieved_rows
-from mvitac.model import Model
-from mvitac.model_files import load
+from mvitac.model import Model, load
 from mvitac.nn.initial import Init
 from mvitac.run import Run
 from mvitac.system.files import brief, write_json

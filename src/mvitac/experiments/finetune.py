@@ -30,8 +30,7 @@ from mvitac.evaluation.probe import ProbeSplit, own_heads, probe_features, split
 from mvitac.evaluation.scores import each_score
 from mvitac.methods.simclr import SimCLRConfig
 from mvitac.methods.supervised import SupervisedConfig
-from mvitac.model import Model
-from mvitac.model_files import fresh, load
+from mvitac.model import Model, fresh, load
 from mvitac.nn.encoders import IMAGENET, EncoderConfig, Encoders
 from mvitac.nn.initial import Init
 from mvitac.run import Optim, Run

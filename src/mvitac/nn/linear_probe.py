@@ -3,7 +3,6 @@
 Shapes: B images, D features (a probe on both modalities reads vision, then touch, concatenated), K classes, T targets.
 """
 
-from bisect import bisect_right
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -62,10 +61,6 @@ class Error:
             raise ValueError(f"{len(self.edges)} edges and {len(self.spread)} spreads: give n ascending and n + 1")
         if not np.isfinite([self.r2, self.mae, self.rmse, *self.edges, *self.spread]).all():
             raise ValueError("errors of a probe must be finite numbers")
-
-    def spread_at(self, value: float) -> float:
-        """The usual error (root mean square) of a prediction of ``value``."""
-        return self.spread[bisect_right(self.edges, value)]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from mvitac.evaluation.probe import scorable
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.run_names import names_of
 from mvitac.evaluation.score_text import WORDS, above, covered, headline, percent, score_name, with_interval
-from mvitac.model_files import load
+from mvitac.model import load
 from mvitac.registry import to_json
 from mvitac.report import galleries, score_sections, tables
 from mvitac.report import sections as evidence

@@ -19,8 +19,7 @@ from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import FILE, file_source, source_of, weights_files, with_ancestors, write_sources
 from mvitac.evaluation.sensors import sensors_of
 from mvitac.methods.base import Method
-from mvitac.model import Model
-from mvitac.model_files import load
+from mvitac.model import Model, load
 from mvitac.nn.encoders import IMAGENET, SCRATCH, build_trunk, is_locked
 from mvitac.nn.imagenet import source
 from mvitac.registry import to_json

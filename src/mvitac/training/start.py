@@ -10,7 +10,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import MODALITIES
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, file_source, read_sources, unknown_source, weights_files
 from mvitac.methods.base import Method
-from mvitac.model_files import load
+from mvitac.model import load
 from mvitac.nn.initial import Init, fits, load_trunk
 from mvitac.nn.momentum import Momentum
 from mvitac.nn.weights import FORMAT, read_safetensors

@@ -19,8 +19,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task
 from mvitac.evaluation import diagnostics
 from mvitac.evaluation.features import pack_features
-from mvitac.model import Model
-from mvitac.model_files import BEST
+from mvitac.model import BEST, Model
 from mvitac.run import Run
 from mvitac.training.log import Log
 from mvitac.training.setup import Setup
