@@ -470,12 +470,14 @@ def test_another_encoder_does_not_replace_a_result(results: list[Path], smoke_ru
     with pytest.raises(ValueError, match="not seeds of one encoder"):
         run_bench([RANDOM.format(6), RANDOM.format(6)], toys, results[0].parent, root, About())
     torch.save(timm.create_model("test_resnet").state_dict(), root / "w.pth")
-    same = [f"external:{root}/w.pth,trunk=test_resnet,size=32,seed={seed}" for seed in (0, 1)]
+    same = [f"external:timm/test_resnet,weights={root}/w.pth,size=32,seed={seed}" for seed in (0, 1)]
     with pytest.raises(ValueError, match="not seeds of one encoder"):
         run_bench(same, toys, results[0].parent, root, About())
 
 
-def test_stacked_sensors_are_read_one_by_one(tmp_path: Path, smoke_run: Path, root: Path) -> None:
+def test_stacked_sensors_are_read_one_by_one(
+    tmp_path: Path, smoke_run: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     toy_pack(tmp_path / "stripes", touch_channels=6)
     opened = open_set(find_suite(str(root / "toys.toml")).sets[1], tmp_path)
     assert not isinstance(opened, str)
@@ -486,9 +488,10 @@ def test_stacked_sensors_are_read_one_by_one(tmp_path: Path, smoke_run: Path, ro
     assert np.allclose(found, expected.numpy(), atol=1e-5)
     left, right = (features(model, view, "touch", rows) for view in score.sensors(pack, "touch", 3))
     assert not np.allclose(left, right)
-    (note,) = Reader(
-        load(f"{RANDOM.format(0)},frames=2"), opened, "x"
-    ).notes  # of an encoder of others: it is in the result
+    monkeypatch.chdir(tmp_path)
+    about = 'import torch\n\ndef pairs():\n    return torch.nn.Conv2d(6, 5, 4, 4), {"size": 16, "frames": 2}\n'
+    (tmp_path / "frames_here.py").write_text(about)
+    (note,) = Reader(load("external:python:frames_here:pairs"), opened, "x").notes
     assert "the current frame is repeated" in note and Reader(model, opened, "x").notes == []
 
 

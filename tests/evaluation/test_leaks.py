@@ -288,7 +288,7 @@ def test_start_weights_of_which_their_owner_says_it(
     run = smoke(pack)
     run = replace(run, encoder=run.encoder.changed(weights=str(file)))
     assert [file_source(file).name for file in weights_files(run)] == [theirs.name]
-    encoder = open_model(f"external:{file},trunk={run.encoder.touch.trunk},size=32")
+    encoder = open_model(f"external:timm/{run.encoder.touch.trunk},weights={file},size=32")
     assert encoder.trained_on == (text or UNKNOWN)
 
 

@@ -184,7 +184,6 @@ def from_init(file: Path, pack: Pack) -> None:
 
 
 ROUTES: dict[str, Callable[[Path, Pack, Path], Any]] = {
-    "external file": lambda file, pack, run: open_model(f"external:{file},trunk={NAME}"),
     "external timm": lambda file, pack, run: open_model(f"external:timm/{NAME},weights={file}"),
     "--init": lambda file, pack, run: from_init(file, pack),
 }

@@ -22,7 +22,7 @@ class _ProbeOptions:
     runs: Positional[tuple[Path, ...]] = ()
     """Folder of each finished run: seeds of one method, or several methods, on the same data."""
     encoder: tuple[str, ...] = ()
-    """Other people's encoders to probe on --on, e.g. external:timm/NAME, external:sparsh:FILE or external:FILE.onnx
+    """Other people's encoders to probe on --on, e.g. external:timm/NAME or external:python:MODULE:FUNCTION
     (docs/bench.md)."""
     config: Annotated[ProbeConfig, tyro.conf.arg(name="")] = ProbeConfig()
     on: Path | None = None

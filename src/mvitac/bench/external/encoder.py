@@ -5,44 +5,13 @@ Shapes: B images, S sensors, F frames, D features, P places.
 
 import copy
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
 from mvitac.bench.external.base import NOTHING, RANDOM, UNKNOWN, Adapter, Loaded, parse
-from mvitac.nn.encoders import num_features
 from mvitac.system.files import brief, digest_file
-
-
-@dataclass(frozen=True)
-class Layout:
-    """How a dataset lays out the images of one modality: [B, F S 3, H, W], newest frame first."""
-
-    sensors: int = 1
-    frames: int = 1
-    gain: float = 0.0  # 2 for difference images, (image - background) / 2 + 128; 0 for plain ones
-
-
-class Plain(nn.Module):
-    """Any module, with the interface of timm's models: ``forward`` gives features, ``forward_features`` what it gives.
-
-    Its output is features [B, D], tokens [B, P, D] of which the first ``prefix`` are no places, or a map [B, D, H, W].
-    """
-
-    def __init__(self, network: nn.Module, prefix: int = 0) -> None:
-        super().__init__()
-        self.network, self.num_prefix_tokens, self.num_features = network, prefix, 0
-
-    def forward_features(self, images: Tensor) -> Tensor:
-        found = self.network(images)
-        return found[:, None] if found.ndim == 2 else found
-
-    def forward(self, images: Tensor) -> Tensor:
-        found = self.forward_features(images)
-        if found.ndim == 4:
-            return found.mean((2, 3))
-        return found[:, min(self.num_prefix_tokens, found.shape[1] - 1) :].mean(1)
 
 
 class ExternalEncoder(nn.Module):
@@ -50,8 +19,7 @@ class ExternalEncoder(nn.Module):
 
     Args:
         adapter: Its options.
-        loaded: What it opened. The network has the interface of timm's models: ``forward`` gives features [B, D],
-            ``forward_features`` tokens [B, P, D] (with ``num_prefix_tokens``) or a map [B, D, H, W].
+        loaded: What it opened.
 
     Raises:
         ValueError: If the network does not take such images.
@@ -59,17 +27,17 @@ class ExternalEncoder(nn.Module):
 
     def __init__(self, adapter: Adapter, loaded: Loaded) -> None:
         super().__init__()
-        self.adapter, self.loaded, self.layout = adapter, loaded, Layout()
+        self.adapter, self.loaded, self.sensors, self.frames = adapter, loaded, 1, 1
         self.network = loaded.network.eval().requires_grad_(False)
         self.preprocessing = adapter.changed(loaded.preprocessing)
         digests = [digest_file(file) for file in loaded.files]
-        known = hashlib.sha256(f"{self.preprocessing} {adapter.pool} {digests}".encode()).digest()
+        known = hashlib.sha256(f"{self.preprocessing} {digests}".encode()).digest()
         # A parameter, so that digests of the weights cover it and networks without weights have a device.
         self.identity = nn.Parameter(torch.frombuffer(bytearray(known), dtype=torch.uint8), requires_grad=False)
         shape = self.preprocessing.input_shape()
         try:
             with torch.no_grad():
-                found = self._pooled(torch.zeros(2, *shape))
+                found = self.network(torch.zeros(2, *shape))
             if found.ndim != 2 or len(found) != 2 or not found.shape[1]:
                 raise ValueError(f"it returns {list(found.shape)} for two images, not [2, D]")
         except Exception as error:  # whatever the network raises
@@ -77,10 +45,10 @@ class ExternalEncoder(nn.Module):
             raise ValueError(f"{adapter.place}: {why}: give its size and frames") from None
         self.num_features = self.width = found.shape[1]
 
-    def bound(self, layout: Layout) -> "ExternalEncoder":
-        """The same encoder, with the same weights, for images of ``layout``."""
+    def bound(self, sensors: int, frames: int) -> "ExternalEncoder":
+        """The same encoder, with the same weights, for images [B, frames x sensors x 3, H, W], newest frame first."""
         made = copy.copy(self)
-        made.layout, made.num_features = layout, self.width * layout.sensors
+        made.sensors, made.frames, made.num_features = sensors, frames, self.width * sensors
         return made
 
     def untrained(self) -> "ExternalEncoder | None":
@@ -92,23 +60,8 @@ class ExternalEncoder(nn.Module):
         return ExternalEncoder(self.adapter, random)
 
     def forward(self, images: Tensor) -> Tensor:
-        return self._pooled(self._prepared(images)).unflatten(0, (-1, self.layout.sensors)).flatten(1)
-
-    def _prepared(self, images: Tensor) -> Tensor:
-        shape = (self.layout.frames, self.layout.sensors, 3)
-        each = images.unflatten(1, shape).transpose(1, 2).flatten(0, 1)  # [B S, F, 3, H, W]
-        return self.preprocessing(each, self.layout.gain)
-
-    def _pooled(self, x: Tensor) -> Tensor:
-        if not self.adapter.pool:
-            return self.network(x).float()
-        found = self.network.forward_features(x)  # type: ignore[operator]
-        if found.ndim == 4:
-            if self.adapter.pool == "cls":
-                raise ValueError("pool=cls needs a network with tokens: give pool=mean")
-            return found.mean((2, 3) if found.shape[1] == num_features(self.network) else (1, 2)).float()
-        front = int(self.network.num_prefix_tokens)  # type: ignore[arg-type]
-        return (found[:, 0] if self.adapter.pool == "cls" else found[:, front:].mean(1)).float()
+        each = images.unflatten(1, (self.frames, self.sensors, 3)).transpose(1, 2).flatten(0, 1)  # [B S, F, 3, H, W]
+        return self.network(self.preprocessing(each)).float().unflatten(0, (-1, self.sensors)).flatten(1)
 
 
 def randomised(network: nn.Module, seed: int) -> nn.Module:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from mvitac.bench.external.base import UNKNOWN
-from mvitac.bench.external.encoder import ExternalEncoder, Layout, open_encoder
+from mvitac.bench.external.encoder import ExternalEncoder, open_encoder
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec, Window
 from mvitac.data.windows import windowed
@@ -47,13 +47,10 @@ class ExternalModel(Model):
     ) -> None:
         nn.Module.__init__(self)
         self.text, self.spec, self.notes, self.name = text, spec, notes, part.loaded.title
-        gains = {"touch": 2.0 if spec.difference else 0.0, "vision": 0.0}
-        if spec.window.minus_first:
-            gains |= {m: 2.0 * max(1.0, gains[m]) for m in spec.window.of}
         self.parts: dict[str, ExternalEncoder] = {}
         for modality in (m for m in spec.modalities if part.adapter.reads in (m, "both")):
             sensors = max(1, spec.channels(modality) // 3 // spec.frames(modality))
-            self.parts[modality] = part.bound(Layout(sensors, spec.frames(modality), gains[modality]))
+            self.parts[modality] = part.bound(sensors, spec.frames(modality))
         self.stored = stored or max(part.preprocessing.size)
         self.encoders = nn.ModuleDict(self.parts)
         self.projectors, self.classifiers, self.tasks, self.probes = nn.ModuleDict(), nn.ModuleList(), (), {}
@@ -98,25 +95,20 @@ class ExternalModel(Model):
         The pack gets windows if an encoder wants several frames, the pack can order its frames, and it has no windows yet.
 
         Raises:
-            ValueError: If the data has no image that this model reads, or the windows that were asked for are impossible.
+            ValueError: If the data has no image that this model reads.
         """
         senses = tuple(m for m in self.parts if m in pack.spec.modalities)
         if not senses:
             known = f"{' and '.join(self.parts)}, {pack.spec.name!r} has {', '.join(pack.spec.modalities)}"
             raise ValueError(f"{self.text} reads {known}: give reads=touch, vision or both")
-        notes, want = [], self.part.preprocessing
+        notes: tuple[str, ...] = ()
+        want = self.part.preprocessing
         if want.frames > 1 and not pack.spec.window.active:
             try:
                 pack = windowed(pack, Window(frames=want.frames, stride=want.stride, of=senses))
             except ValueError as error:
-                if self.part.adapter.stride is not None:
-                    raise
-                notes.append(f"the current frame is repeated ({error})")
-        for modality in senses if want.offset is not None else ():
-            window, sense = pack.spec.window, modality == "touch" and pack.spec.difference
-            if not (sense or (window.minus_first and modality in window.of)):
-                notes.append(f"{modality}: its owner subtracts a background, this data has none: images as they are")
-        return ExternalModel(self.text, self.part, pack.spec, pack.size, tuple(notes)), pack
+                notes = (f"the current frame is repeated ({error})",)
+        return ExternalModel(self.text, self.part, pack.spec, pack.size, notes), pack
 
     def untrained(self) -> "ExternalModel | None":
         """The same network with random weights, as a control; None where that is not possible."""
@@ -148,7 +140,7 @@ class ExternalModel(Model):
 
 
 def _described(part: ExternalEncoder) -> dict[str, Any]:
-    loaded, layout, preprocessing = part.loaded, part.layout, part.preprocessing
+    loaded = part.loaded
     return {
         "title": loaded.title,
         "licence": loaded.licence,
@@ -158,11 +150,9 @@ def _described(part: ExternalEncoder) -> dict[str, Any]:
         "files": {file.name: digest_file(file) for file in loaded.files},
         "parameters": sum(p.numel() for p in loaded.network.parameters()),
         "features": part.num_features,
-        "pool": part.adapter.pool or "owner's",
-        "preprocessing": to_json(preprocessing),
-        "sensors": layout.sensors,
-        "frames_given": layout.frames,
-        "background_subtracted": bool(layout.gain) and preprocessing.offset is not None,
+        "preprocessing": to_json(part.preprocessing),
+        "sensors": part.sensors,
+        "frames_given": part.frames,
     }
 
 

@@ -6,7 +6,7 @@ Preprocessing is that of the model's ``pretrained_cfg`` (huggingface/pytorch-ima
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 from timm.data.config import resolve_data_config
 from torch import nn
@@ -47,8 +47,6 @@ class Timm(Adapter):
     """A model of timm."""
 
     name: ClassVar[str] = "timm"
-    expects: ClassVar[str] = "the name of a timm model"
-    reads: Literal["touch", "vision", "both"] = "both"
     weights: str = "pretrained"
     """pretrained (timm downloads them), random, or a file."""
 
@@ -73,7 +71,7 @@ class Timm(Adapter):
         )
 
     def _built(self, weights: str) -> nn.Module:
-        trunk = build_trunk(EncoderConfig(trunk=self.place, weights=weights), 3 * (self.frames or 1))
+        trunk = build_trunk(EncoderConfig(trunk=self.place, weights=weights), 3)
         if self.size and hasattr(trunk, "set_input_size"):
             try:
                 trunk.set_input_size(img_size=self.sides((224, 224)))  # type: ignore[operator]
