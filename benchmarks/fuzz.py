@@ -1,7 +1,7 @@
 """Call every command with odd values of every option of its help: no traceback, no hang, only known exit codes.
 
     python -m benchmarks.fuzz --calls 1000            # spread evenly over all commands, options and values
-    python -m benchmarks.fuzz --commands live explore --calls 0      # 0 = every call that can be generated
+    python -m benchmarks.fuzz --commands live find --calls 0      # 0 = every call that can be generated
 
 The options are read from ``--help``. Each call is one that works, with one option added, replaced, doubled, left out or
 without its value. It runs in a process forked from one that has imported the library, in a fresh copy of a small folder,
@@ -47,7 +47,6 @@ READING = {
     "data check --data": "data check --data folder --path {base}/table --workers 1",
     "data show": "data show {base}/pack --out {out}/show.png",
     "live": "live {base}/export --vision {base}/table@99 --touch {base}/table@99 --seconds 1",
-    "explore": "explore {base}/run --port 0",
     "find": "find {base}/table/touch0.png --model {base}/run --known {base}/e.parquet --from touch --to touch",
     "pretrain mix": "pretrain --recipe smoke --data mix --data.parts a={base}/pack:1 b={base}/pack:2 --augment.size 16"
     " --steps 2 --batch-size 8 --eval-every 0 --quiet --out {out}/m",
@@ -56,8 +55,7 @@ READING = {
 }
 COMMANDS = {**WRITING, **READING}
 """One call of each command that works; ``base`` holds its inputs."""
-SERVES = ("live", "explore")
-MODULES = (*SLOW, "mvitac.report.explorer", "mvitac.deploy.export", "mvitac.deploy.search", "torch.onnx")
+MODULES = (*SLOW, "mvitac.deploy.export", "mvitac.deploy.search", "torch.onnx")
 WORDS = [
     "nan",
     "inf",
@@ -195,7 +193,7 @@ def fuzz(chosen: list[list[str]], base: Path, limit: float) -> dict[str, Any]:
         if why := wrong(ended, text):
             failed.append({"call": line, "why": why, "said": text[-1500:]})
             print(f"{why}: {line}", file=sys.stderr, flush=True)
-        elif took > limit and words[0] not in SERVES:
+        elif took > limit and words[0] != "live":
             slow.append(line)
     return {"calls": len(chosen), "codes": dict(codes), "interrupted": slow, "failed": failed}
 

@@ -97,7 +97,6 @@ def data(name: str, **fields: Any) -> Change:
 
 COMMANDS = {
     "export": ["export", "{artifact}", "--out", "{out}"],
-    "explore": ["explore", "{artifact}"],
     "probe": ["probe", "{artifact}"],
     "report": ["report", "{artifact}", "--quiet"],
     "live": ["live", "{artifact}", "--seconds", "1"],

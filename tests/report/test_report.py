@@ -36,7 +36,7 @@ from mvitac.methods.supervised import SupervisedConfig
 from mvitac.recipes import recipe
 from mvitac.registry import to_json
 from mvitac.report import figures
-from mvitac.report.galleries import nearest_groups
+from mvitac.report.galleries import nearest_groups, nearest_rows
 from mvitac.report.report import write_report
 from mvitac.report.tables import retrieval_rows
 from mvitac.run import Run
@@ -211,8 +211,24 @@ def test_shown_row_is_the_group_member_most_like_the_query() -> None:
     assert [q.found[0] for q in found] == [(1, "right"), (2, "right")]
 
 
+def test_a_mistake_is_nearest_to_another_class(tmp_path: Path) -> None:
+    near = nearest_rows(np.array([[1.0, 0.0], [0.9, 0.1], [5.0, 1.0], [0.0, 2.0]]), np.array(["a", "a", "b", "c"]), 2)
+    assert near.tolist() == [[2, 3], [2, 3], [1, 0], [2, 1]]  # never of the own group; lengths do not matter
+    run, _ = noise(tmp_path, Noise())
+    html = write_report([run], tmp_path / "out", quiet=True).read_text()
+    html = html[html.index('<h2 id="mistakes">') : html.index('<h2 id="map">')]
+    strips = html.split('<div class="query">')[1:]
+    assert 2 <= len(strips) <= 16 and re.search(r"touch: \d+ of 24 rows", html)
+    for strip in strips:
+        marks = re.findall(r'<div class="(same|wrong)">', strip)
+        assert len(marks) == 5 and marks.count("same") <= 2
+        own, *found = re.findall(r"<span>(.*?)[;<]", strip)
+        assert [mark == "same" for mark in marks] == [name == own for name in found]
+
+
 def test_gallery_agrees_with_the_score(materials: Path, result: dict[str, Any]) -> None:
     html = (materials / "out" / "report.html").read_text()
+    html = html[html.index('<h2 id="gallery">') :]
     queries = re.findall(r'<div class="query">.*?(?=<div class="query">|</section>)', html, re.DOTALL)
     assert len(queries) == 16
     for query in queries:
@@ -245,8 +261,7 @@ def test_touch_alone(tmp_path: Path) -> None:
     run, _ = noise(tmp_path, Noise(vision=0))
     page = Page(write_report([run], tmp_path / "out", quiet=True).read_text())
     assert "Not scored: it takes a space that both modalities share" in page.text
-    assert not page.images("jpeg")
-    assert "Touch reaches" in page.text
+    assert "has rank" not in page.text and "Touch reaches" in page.text
     assert not (tmp_path / "out" / "figures" / "map-vision.png").exists()
 
 
@@ -256,7 +271,7 @@ def test_without_labels(tmp_path: Path) -> None:
     page = Page(write_report([run], tmp_path / "out", quiet=True).read_text())
     assert "Scores of the frozen features" not in page.text
     assert "finds its thing among the first five by camera" in page.text
-    assert len(page.images("jpeg")) == 2 * 8 * 6  # eight queries with five groups, both directions
+    assert len(page.images("jpeg")) == 2 * 2 * 8 * 6  # eight queries with five groups or rows, both ways
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -269,15 +284,14 @@ def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
     assert "supervised, mvitac on noise" in page.text
     assert "The same by logistic regression" in page.text
     assert "parts of the loss, mvitac" in page.text
-    assert len(page.images("jpeg")) == 2 * 8 * 6  # the gallery of the second run; the first one has none
+    assert page.text.count("has rank") == 2 * 8  # the gallery of the second run; the first one has none
     linear, nearest = (summarise(result["records"], kind)["kind"]["both"] for kind in ("linear", "knn"))
     assert f"with supervised, mvitac {100 * nearest['mvitac']['mean']:.1f}" in page.text
     assert cell_text({"both": linear}, "mvitac", "both") in page.text.replace("\xa0", " ")
     assert not page.all("script")
     alone = Page(write_report([first], tmp_path / "alone", quiet=True).read_text())
     assert "Not scored: it takes a space that both modalities share" in alone.text
-    assert "The runs left no log lines." in alone.text
-    assert not alone.images("jpeg")
+    assert "The runs left no log lines." in alone.text and "has rank" not in alone.text
 
 
 def test_bars_carry_leaks_and_lines_spare_the_names() -> None:

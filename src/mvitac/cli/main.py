@@ -36,7 +36,6 @@ COMMANDS = {
     "export": "deploy:export",
     "predict": "live:predict",
     "live": "live:live",
-    "explore": "explore:explore",
     "embed": "search:embed",
     "find": "search:find",
 }

@@ -54,7 +54,7 @@ def pretrain(argv: list[str]) -> None:
     with open_loggers(chosen.get("--logger"), options.out, options.run) as loggers:
         out = train(options.run, options.out, resume=options.resume, quiet=options.quiet, loggers=loggers, pack=pack)
     data = read_record(out / "run.json")[1].get("data", {})
-    known = "probe" if data.get("tasks") or data.get("values") else "explore"
+    known = "probe" if data.get("tasks") or data.get("values") else "report"
     print(f"trained: {out}\nnext: mvitac {known} {out}")
 
 

@@ -38,7 +38,7 @@ FORMATS = ("JPEG", "PNG", "BMP", "TIFF", "WEBP", "PPM", "GIF")
 def decode(path: str | Path | BinaryIO, name: str = "", span: Sequence[float] = ()) -> Image.Image:
     """Read an image file as RGB: rotated by EXIF, 16 bits scaled to 8, transparent parts black.
 
-    Packs, ``find``, ``live FOLDER`` and the explorer all read files with it; ``Model.embed`` treats PIL images alike.
+    Packs, ``find`` and ``live FOLDER`` read files with it; ``Model.embed`` treats PIL images alike.
 
     ``name`` is the name of an open file in error messages; ``span`` are the numbers of 16 bits or floats that become
     black and white, by default 0 and 65535.

@@ -32,11 +32,6 @@ class Task(_About):
     """Class names, indexed by label. The label column is ``label_<name>``; -1 = unlabelled."""
 
 
-def task_title(name: str, classes: Sequence[str]) -> str:
-    """The name of a task for people: "hard/soft" for a task "soft" of these two classes, otherwise the name itself."""
-    return "/".join(classes) if len(classes) == 2 and name in classes else name
-
-
 def listed(names: Sequence[str], most: int = 8) -> str:
     """``names`` for people; of more than ``most`` the first, and how many are left."""
     rest = len(names) - most

@@ -1,1 +1,1 @@
-"""The report, contact sheets and the explorer."""
+"""The report and contact sheets."""

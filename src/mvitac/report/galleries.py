@@ -1,4 +1,4 @@
-"""Pictures of features: a 2D map coloured by label, and a gallery of cross-modal retrieval.
+"""Pictures of features: a 2D map coloured by label, rows that are confused, and a gallery of cross-modal retrieval.
 
 Shapes: features [N, D] of the rows shown; L2-normalised embeddings in the space that both modalities share [N, E].
 """
@@ -89,7 +89,43 @@ def feature_maps(study: Study) -> list[Markup]:
     return [html.paragraph(intro), html.grid(drawn, "grid large")]
 
 
+def nearest_rows(values: np.ndarray, groups: np.ndarray, num: int = NUM_FOUND) -> np.ndarray:
+    """The ``num`` rows of other ``groups`` [N] whose ``values`` [N, D] are nearest by cosine, of each row: [N, num]."""
+    unit = values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12)
+    similarity = np.where(groups[:, None] == groups, -np.inf, unit @ unit.T)
+    return np.argsort(-similarity, axis=1, kind="stable")[:, :num]
+
+
+def mistakes(study: Study) -> list[Markup]:
+    """Random rows whose nearest rows have another class, with these; without any labels, random rows."""
+    split, rows = study.rows()
+    rows = sample(rows, NUM_MAP)
+    groups, labels = study.pack.column("group")[rows].astype(str), study.labels(rows)
+    if len(rows) - np.unique(groups, return_counts=True)[1].max() < NUM_FOUND:
+        return []  # too few rows of other groups
+    halves, known = [], bool((labels >= 0).any())
+    for modality in study.pack.spec.modalities:
+        near = nearest_rows(features(study.runs[0].model, study.pack, modality, rows), groups)
+        same = labels[near] == labels[:, None]
+        asked = np.flatnonzero((labels >= 0) & (same.sum(1) <= NUM_FOUND // 2) if known else labels < 0)
+        shown = []
+        for at in sample(asked, NUM_QUERIES).tolist():
+            kinds = ("" if labels[i] < 0 else "same class" if labels[i] == labels[at] else "other" for i in near[at])
+            found = list(zip(rows[near[at]].tolist(), kinds, strict=True))
+            shown.append(_strip(study, (modality, modality), rows[at], groups[at], found))
+        halves.append(html.card(f"{modality}: {len(asked)} of {len(rows)} rows" if known else modality, shown))
+    by, tasks, name = study.pack.spec.group_by, study.pack.spec.tasks, study.runs[0].path.name
+    whose = f" whose five nearest rows are mostly of another {tasks[0].name}" if known else ""
+    intro = (
+        f"{split} rows{whose}, drawn at random (seed 0). Left: the row. Then, best first, the five rows of other {by}s"
+        f" whose features of the same modality are nearest ({name})."
+    )
+    return [html.paragraph(intro[0].upper() + intro[1:]), html.grid(halves, "queries")]
+
+
 _SHOWN = {
+    "": ("", ""),
+    "other": ("wrong", "\u2715 another class"),
     "right": ("right", "\u2713 right"),
     "same class": ("same", "\u2248 same class"),
     "wrong": ("wrong", "\u2715 wrong"),
@@ -110,7 +146,17 @@ def gallery(study: Study) -> list[Markup]:
     halves = []
     for asked, searched in (("touch", "vision"), ("vision", "touch")):
         found = nearest_groups(z[asked], z[searched], groups, labels, queries.tolist())
-        shown = [_query(study, rows, asked, searched, query, int(groups.max()) + 1) for query in found]
+        by, num = study.pack.spec.group_by, int(groups.max()) + 1
+        shown = [
+            _strip(
+                study,
+                (asked, searched),
+                rows[query.row],
+                f"its {by} has rank {query.rank} of {num}",
+                [(rows[row], kind) for row, kind in query.found],
+            )
+            for query in found
+        ]
         halves.append(html.card(f"{asked} → {searched}", shown))
     by, tasks = study.pack.spec.group_by, study.pack.spec.tasks
     intro = (
@@ -121,13 +167,13 @@ def gallery(study: Study) -> list[Markup]:
     return [html.paragraph(intro), html.grid(halves, "queries")]
 
 
-def _query(study: Study, rows: np.ndarray, asked: str, searched: str, query: Query, num_groups: int) -> Markup:
-    image, name = _picture(study, asked, rows[query.row])
-    rank = f"its {study.pack.spec.group_by} has rank {query.rank} of {num_groups}"
-    cells = [html.cell("asked", image, "", f"{name}; {rank}")]
-    for row, kind in query.found:
+def _strip(study: Study, senses: tuple[str, str], row: int, text: str, found: Sequence[tuple[int, str]]) -> Markup:
+    """The picture of ``row`` in the first of ``senses``, with ``text``, and the rows ``found`` in the second."""
+    image, name = _picture(study, senses[0], row)
+    cells = [html.cell("asked", image, "", f"{name}; {text}")]
+    for other, kind in found:
         css, mark = _SHOWN[kind]
-        image, name = _picture(study, searched, rows[row])
+        image, name = _picture(study, senses[1], other)
         cells.append(html.cell(css, image, mark, name))
     return html.grid(cells, "query")
 

@@ -14,7 +14,6 @@ COLOURS = {
     "sky": "#4fb0e2",
     "olive": "#8d8a1e",
     "brown": "#7b5334",
-    "indigo": "#5b21d6",
     "grey1": "#6d7783",
     "grey2": "#8c95a0",
     "grey3": "#a8b0b9",
@@ -22,6 +21,5 @@ COLOURS = {
 }
 """Hues after Okabe and Ito, distinct with any colour vision."""
 HUES = ("blue", "vermilion", "green", "amber", "purple", "sky", "olive", "brown")
-MAP_HUES = (*HUES, "ink", "indigo")  # ten colours for the explorer's map: as many as an eye can tell apart
 MODALITY_HUES = {"touch": "blue", "vision": "vermilion", "both": "green"}
 CONTROL_GREYS = {"imagenet": "grey1", "start": "soft", "untrained": "grey2", "pixels": "grey3", "border": "grey4"}

@@ -93,6 +93,7 @@ def _page(study: Study) -> str:
         "collapse": ("Learning or collapsing?", evidence.collapse),
         "confusion": ("Confusion", evidence.confusions),
         "values": ("Predicted and true values", score_sections.values),
+        "mistakes": ("Mistakes and neighbours", galleries.mistakes),
         "map": ("A map of the features", galleries.feature_maps),
         "gallery": ("Retrieval gallery", galleries.gallery),
         "settings": ("Settings", _settings),
