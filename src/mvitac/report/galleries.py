@@ -112,7 +112,7 @@ def mistakes(study: Study) -> list[Markup]:
         for at in sample(asked, NUM_QUERIES).tolist():
             kinds = ("" if labels[i] < 0 else "same class" if labels[i] == labels[at] else "other" for i in near[at])
             found = list(zip(rows[near[at]].tolist(), kinds, strict=True))
-            shown.append(_strip(study, (modality, modality), rows[at], groups[at], found))
+            shown.append(_strip(study, (modality, modality), int(rows[at]), str(groups[at]), found))
         halves.append(html.card(f"{modality}: {len(asked)} of {len(rows)} rows" if known else modality, shown))
     by, tasks, name = study.pack.spec.group_by, study.pack.spec.tasks, study.runs[0].path.name
     whose = f" whose five nearest rows are mostly of another {tasks[0].name}" if known else ""
