@@ -70,14 +70,13 @@ def test_what_is_stopped_says_the_command_that_goes_on(
 
 
 def test_a_path_is_data(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A pack, a table, a folder, a tar; a name of a dataset is that, also beside a folder of this name."""
+    """A pack, a table, a folder; a name of a dataset is that, also beside a folder of this name."""
     (tmp_path / "pairs.csv").touch()
-    (tmp_path / "a.tar").touch()
     (tmp_path / "robot" / "meta").mkdir(parents=True)
     (tmp_path / "robot" / "meta" / "info.json").touch()
     monkeypatch.chdir(tmp_path)
     (tmp_path / "materials").mkdir()
-    found = {"pairs.csv": "folder", "a.tar": "webdataset", "robot": "lerobot", str(pack.path): "pack", ".": "folder"}
+    found = {"pairs.csv": "folder", "robot": "lerobot", str(pack.path): "pack", ".": "folder"}
     for path, name in found.items():
         assert dataset(path) == replace(default(DatasetConfig, name), path=Path(path))
     assert dataset("materials") == default(DatasetConfig, "materials")

@@ -11,8 +11,8 @@ import pytest
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
-from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
+from mvitac.data.several import JoinedPack
 from mvitac.data.source import Sample
 from mvitac.data.spec import DataSpec, Task
 from mvitac.datasets.pack import PackConfig
@@ -64,7 +64,7 @@ def test_train_is_of_the_one_and_test_of_the_other(pack: Pack, negative: Pack) -
 
 @pytest.mark.parametrize("column", ["sensor", "lamp", "phase"])
 def test_columns_matter_that_probes_read(tmp_path: Path, column: str) -> None:
-    """A name here, a number there: of no matter in a column beside, an error in one that says what a task is about."""
+    """A name here, a number there: of no matter in a column beside, and text in one that says what a task is about."""
 
     class Marked(Toy):
         mark: object = "during"
@@ -88,9 +88,9 @@ def test_columns_matter_that_probes_read(tmp_path: Path, column: str) -> None:
     elif column == "lamp":
         assert "lamp" not in JoinedPack(*packs).table.column_names
     else:
-        with pytest.raises(ValueError, match=r"columns differ in kind .*phase"):
-            JoinedPack(*packs)
-        with pytest.raises(ValueError, match=r"task 'pattern' is about other rows or split otherwise in"):
+        joined = JoinedPack(*packs)
+        assert (joined.labels("pattern")[packs[0].num :] == -1).all() and (joined.labels("pattern") >= 0).any()
+        with pytest.raises(ValueError, match=r"task 'pattern' has other rows, splits or units in"):
             JoinedPack(packs[0], toy_pack(tmp_path / "c"))
 
 

@@ -12,8 +12,8 @@ import pytest
 
 from mvitac.cli.main import main
 from mvitac.data.images import fit
-from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
+from mvitac.data.several import MixedPack
 from mvitac.data.source import Sample
 from mvitac.data.spec import DataSpec, Target, ValueTask, Window
 from mvitac.data.windows import windowed
@@ -71,8 +71,8 @@ def test_one_task_if_classes_agree_else_two(pack: Pack, gel: Pack) -> None:
         expected = np.full(mix.num, -1)
         expected[first : first + part.num] = part.labels("bright")
         np.testing.assert_array_equal(mix.labels(name), expected)
-    assert mix.spec.controls == {"noise only": ("toy/noise",)}  # a column of this name is no control in gel
-    np.testing.assert_array_equal(np.isfinite(mix.column("toy/noise")), mix.column("part") == "toy")
+    assert mix.spec.controls == {"noise only": ("noise",)}  # a column of this name is no control in gel
+    np.testing.assert_array_equal(np.isfinite(mix.column("noise")), mix.column("part") == "toy")
 
 
 @dataclass
@@ -97,17 +97,18 @@ class Pressed(Slice):
         return [replace(sample, columns={**sample.columns, **extra})]
 
 
-@pytest.mark.parametrize("other", [{"unit": "mN"}, {"own_split": True}, {"kind": "1"}, {}])
+@pytest.mark.parametrize("other", [{"unit": "mN"}, {"own_split": True}, {"kind": "1"}, {}], ids=str)
 def test_values_keep_their_unit_rows_and_split(gel: Pack, tmp_path: Path, other: dict[str, Any]) -> None:
-    """``kind`` is a number here and a text there: the filter is of each part's own column."""
+    """Where ``kind`` is a number here and a text there, the task is the same: conditions compare text."""
     a = built(Pressed(num=30), tmp_path / "a")
     b = built(Pressed(num=30, first=60, **other), tmp_path / "b")
     mix = MixedPack({"a": a, "b": b, "gel": gel})
     names = [task.name for task in mix.spec.values]
-    assert names == (["a/force", "b/force"] if other else ["force"])
+    apart = bool(other) and "kind" not in other
+    assert names == (["a/force", "b/force"] if apart else ["force"])
     for task in mix.spec.values:
         values = mix.values(task)[:, 0]
-        there = np.isin(mix.column("part"), ["a", "b"] if not other else [task.name[0]])
+        there = np.isin(mix.column("part"), [task.name[0]] if apart else ["a", "b"])
         np.testing.assert_array_equal(np.isfinite(values), there)
         np.testing.assert_array_equal(values[there], np.tile(np.arange(30) / 2, there.sum() // 30))
         if task.split != "split":
@@ -207,7 +208,7 @@ def test_what_cannot_be_mixed_is_refused(pack: Pack, tmp_path: Path) -> None:
         (Scores(num=12), "part b .* has no rows in split train or unlabelled: leave it out"),
         (Slice(num=12, touch_channels=6), "touch channels differ: 3 in a, 6 in b; pack them"),
         (Minus(num=12), "touch is minus its background in b and not in a: pack both alike"),
-        (Toy(), "parts a and b are the same data: give each pack once, with a weight"),
+        (Toy(), "two of the parts a, b are the same data: give each pack once, with a weight"),
     ]
     for number, (source, message) in enumerate(cases):
         other = built(source, tmp_path / str(number))

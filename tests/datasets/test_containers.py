@@ -1,11 +1,9 @@
-"""Images inside something else: LeRobot datasets, tars, parquet of the hub; each pixel beside its own row."""
+"""Images inside something else: LeRobot datasets, parquet of the hub; each pixel beside its own row."""
 
 from __future__ import annotations
 
 import io
 import json
-import os
-import tarfile
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +18,6 @@ from mvitac.data.pack import Pack
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.lerobot.reader import LeRobotConfig, choose
 from mvitac.datasets.table.table import RowsConfig
-from mvitac.datasets.webdataset import WebDatasetConfig
 from support.videos import film, shade
 
 
@@ -217,11 +214,7 @@ def test_lerobot_reads_values_and_elements_of_vectors(tmp_path: Path) -> None:
         LeRobotConfig(path=root, size=16, values=("observation.state[2]:mm",)).source()
 
 
-def test_webdataset_hub_and_manifests_read_values(tmp_path: Path) -> None:
-    tars = make_tars(tmp_path / "tars")
-    config = WebDatasetConfig(path=tars, size=16, allow_missing=True, values=("pose=pose[1]:mm,force:N",))
-    values, shown = measured(packed(config, tmp_path / "w"))
-    assert np.allclose(values, np.stack([shown / 4, shown / 2], axis=1))
+def test_hub_and_manifests_read_values(tmp_path: Path) -> None:
     hub = FolderConfig(path=make_hub(tmp_path / "hub"), size=16, vision="photo", values=("both=depth:mm,pose[2]:deg",))
     values, shown = measured(packed(hub, tmp_path / "h"))
     number = np.where(shown == 104, np.nan, shown - 100)
@@ -240,64 +233,6 @@ def test_webdataset_hub_and_manifests_read_values(tmp_path: Path) -> None:
         config = FolderConfig(path=tmp_path / f"m.{kind}", size=16, values=("p=pose[0]:mm,pose[2]:mm",))
         values, shown = measured(packed(config, tmp_path / kind))
         assert np.array_equal(values, np.stack([shown / 2, -shown / 4], axis=1)), kind
-
-
-# -- WebDataset -------------------------------------------------------------------------------------------------------
-
-
-def add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
-    member = tarfile.TarInfo(name)
-    member.size = len(content)
-    tar.addfile(member, io.BytesIO(content))
-
-
-def make_tars(root: Path, mode: str = "w") -> Path:
-    root.mkdir(parents=True)
-    for shard in (0, 1):
-        with tarfile.open(root / f"shard-{shard}.tar", mode) as tar:  # type: ignore[call-overload]
-            for i in range(12 * shard, 12 * shard + 12):
-                known = {
-                    "material": ("wood", "metal")[i // 2 % 2],
-                    "object": i // 2,
-                    "force": i / 2,
-                    "pose": [1, i / 4],
-                }
-                add(tar, f"set/{i:04d}.vision.png", png(i))
-                add(tar, f"set/{i:04d}.json", json.dumps(known).encode())
-                if i != 5:
-                    add(tar, f"set/{i:04d}.touch.PNG", png(100 + i))
-                add(tar, f"set/{i:04d}.cls", b"7\n")
-    return root
-
-
-def test_a_webdataset_is_read_in_place(tmp_path: Path) -> None:
-    root = make_tars(tmp_path / "tars")
-    options: dict[str, Any] = {"labels": ("material",), "group": "object", "size": 16, "controls": ("force=force",)}
-    with pytest.raises(ValueError, match=r"row 6 \(set/0005\) has no touch path: .*allow-missing"):
-        WebDatasetConfig(path=root, **options).source()
-    pack = packed(WebDatasetConfig(path=root, allow_missing=True, **options), tmp_path / "pack")
-    assert pack.num == 24
-    for row, name in enumerate(pack.column("id")):
-        i = int(name.split("/")[1])
-        assert (pack.images["vision"][row] == i).all()
-        assert (pack.images["touch"][row] == (0 if i == 5 else 100 + i)).all()
-        assert pack.column("label_material")[row] == (1, 0)[i // 2 % 2]
-        assert pack.column("force")[row] == i / 2
-    one = packed(WebDatasetConfig(path=root / "shard-1.tar", **options), tmp_path / "one")
-    assert one.num == 12
-
-
-def test_the_cache_knows_another_tar_of_the_same_size(tmp_path: Path) -> None:
-    """By its time or, where that is the same too, by where its members lie."""
-    options, packs = WebDatasetConfig(path=tmp_path / "shard.tar", size=16, workers=1), []
-    for value, extra, when in ((40, 0, 10), (200, 0, 20), (90, 3, 20)):
-        with tarfile.open(options.path, "w") as tar:
-            for i in range(8):
-                add(tar, f"{i:04d}.touch.png", png(value) + bytes(extra))
-                add(tar, f"{i:04d}.json", json.dumps({"split": "train" if i < 4 else "test"}).encode())
-        os.utime(options.path, (when, when))
-        packs.append(options.open(quiet=True))
-    assert [int(pack.images["touch"][0, 0, 0, 0]) for pack in packs] == [40, 200, 90]
 
 
 # -- parquet of the hub -----------------------------------------------------------------------------------------------
@@ -339,24 +274,16 @@ def test_image_parquet_of_the_hub(tmp_path: Path) -> None:
     assert len({level(image) for image in pack.images["touch"]}) == 30
 
 
-def test_the_scale_of_16_bits_holds_inside_tars_and_parquet(tmp_path: Path) -> None:
+def test_the_scale_of_16_bits_holds_inside_parquet(tmp_path: Path) -> None:
     rows = []
-    with tarfile.open(tmp_path / "a.tar", "w") as tar:
-        for i in range(20):
-            buffer = io.BytesIO()
-            Image.fromarray(np.full((16, 20), 10 * i, np.uint16)).save(buffer, "PNG")
-            add(tar, f"{i:02d}.touch.png", buffer.getvalue())
-            rows.append({"touch": buffer.getvalue(), "thing": i})
+    for i in range(20):
+        buffer = io.BytesIO()
+        Image.fromarray(np.full((16, 20), 10 * i, np.uint16)).save(buffer, "PNG")
+        rows.append({"touch": buffer.getvalue(), "thing": i})
     pq.write_table(pa.Table.from_pylist(rows), tmp_path / "a.parquet")
-    options: dict[str, Any] = {"range": ("touch=0:200",), "size": 16}
-    tar, hub = (
-        WebDatasetConfig(path=tmp_path / "a.tar", **options),
-        FolderConfig(path=tmp_path / "a.parquet", **options),
-    )
-    for config in (tar, hub):
-        pack = packed(config, tmp_path / config.name)
-        assert np.abs(pack.images["touch"][:, 8, 8, 0] - 12.75 * np.arange(20)).max() <= 0.5
-        assert pack.spec.notes[0] == "touch has more than 8 bits: 0 is black, 200 white"
+    pack = packed(FolderConfig(path=tmp_path / "a.parquet", range=("touch=0:200",), size=16), tmp_path / "pack")
+    assert np.abs(pack.images["touch"][:, 8, 8, 0] - 12.75 * np.arange(20)).max() <= 0.5
+    assert pack.spec.notes[0] == "touch has more than 8 bits: 0 is black, 200 white"
 
 
 def test_a_table_shows_no_image_of_other_folders(tmp_path: Path) -> None:

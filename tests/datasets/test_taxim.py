@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mvitac.data.build import build
-from mvitac.data.joined_pack import JoinedPack
+from mvitac.data.several import JoinedPack
 from mvitac.datasets.taxim import TaximConfig
 from mvitac.sim.ball import FIELD_MM
 

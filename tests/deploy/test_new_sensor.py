@@ -12,8 +12,8 @@ import torch
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
-from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
+from mvitac.data.several import JoinedPack
 from mvitac.data.source import Sample
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import Materials, MaterialsConfig

@@ -18,9 +18,9 @@ from mvitac.bench.external import open_model
 from mvitac.bench.external.timm_models import said
 from mvitac.cli.main import main
 from mvitac.data.build import build
-from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
 from mvitac.data.row_hashes import image_sums, known_images
+from mvitac.data.several import JoinedPack
 from mvitac.data.source import Sample
 from mvitac.data.spec import DataSpec
 from mvitac.datasets.pack import ON_VAL, PackConfig

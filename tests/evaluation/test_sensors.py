@@ -11,9 +11,8 @@ import pytest
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
-from mvitac.data.joined_pack import JoinedPack
-from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
+from mvitac.data.several import JoinedPack, MixedPack
 from mvitac.data.source import Sample
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation import features as features_module

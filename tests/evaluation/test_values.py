@@ -13,8 +13,8 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from mvitac.data.build import build
-from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
+from mvitac.data.several import JoinedPack
 from mvitac.data.spec import Target, ValueTask
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.pack import PackConfig
@@ -216,7 +216,7 @@ def test_packs_with_other_units_cannot_be_joined(measured: Pack) -> None:
     other = Pack(measured.path)
     task = replace(other.spec.values[0], targets=(Target(name="level", unit="%"),))
     other.spec = replace(other.spec, values=(task,))
-    with pytest.raises(ValueError, match=r"level in levels in .* and level in %"):
+    with pytest.raises(ValueError, match=r"task .light. has other rows, splits or units in"):
         JoinedPack(measured, other)
 
 

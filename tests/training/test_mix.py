@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from mvitac.cli.main import main
-from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
+from mvitac.data.several import MixedPack
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.methods.base import MethodConfig, Views
 from mvitac.methods.mvitac import MViTacConfig

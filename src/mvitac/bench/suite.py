@@ -14,8 +14,8 @@ from typing import Any, Literal
 import numpy as np
 
 from mvitac.bench.external.base import parse
-from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
+from mvitac.data.several import JoinedPack
 from mvitac.data.spec import AnyTask, Task
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.table.splits import folds

@@ -8,8 +8,8 @@ import tyro
 from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, check_models, loading, parse, printed_to, save_json
-from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
+from mvitac.data.several import JoinedPack
 from mvitac.evaluation.probe_config import ProbeConfig
 from mvitac.shipped import BASE
 from mvitac.system.progress import shown

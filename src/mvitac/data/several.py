@@ -1,21 +1,32 @@
-"""Several packs as one: the rows of one pack after another, images read where they are.
+"""Several packs as one: their rows one after another, images read where they are.
 
-The parts that ``mixed_pack`` (training) and ``joined_pack`` (probes) share.
+``MixedPack`` is several packs to train on. ``JoinedPack`` is two for probes, which learn on the one and are scored on the
+other.
 """
 
+import functools
+import itertools
+import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 
 from mvitac.data.lazy import Pieces
 from mvitac.data.pack import Pack
-from mvitac.data.row_hashes import known_images
-from mvitac.data.spec import MODALITIES, AnyTask, Task
+from mvitac.data.row_hashes import image_sums, known_images, row_hashes
+from mvitac.data.spec import MODALITIES, AnyTask, DataSpec, Task, ValueTask
 from mvitac.registry import unknown
+from mvitac.system.files import digest
+
+Columns = dict[str, pa.Array | pa.ChunkedArray]
+Tasks = Mapping[str, AnyTask]
+"""Name of a task in a part -> the task of all parts."""
 
 
-class Several(Pack):
+class _Several(Pack):
     """Rows of packs one after another; a subclass sets ``path``, ``table``, ``spec``, ``size`` and ``digests``."""
 
     def _open(self, packs: Sequence[Pack]) -> None:
@@ -30,27 +41,312 @@ class Several(Pack):
         return np.concatenate([pack.own_ids for pack in self._packs])
 
 
-Columns = dict[str, pa.Array | pa.ChunkedArray]
+class MixedPack(_Several):
+    """The rows of all ``parts``, one part after another.
+
+    A row has the split, labels, values and groups that it has in its part (``_mixed_columns``). A part without a modality
+    has no image of it.
+
+    Attributes:
+        weights: How often each part is drawn in training, relative to the others; () = by its number of rows.
+        temperature: Without weights, parts are drawn in proportion to (number of rows)^temperature.
+        one_part: Whether all rows of a batch are of one part.
+
+    Args:
+        parts: Name -> pack, at least two.
+        size: Side of the images in pixels; images of another side are resized when they are read. 0: the largest side.
+        allow_leak: Accept groups, rows and images that one part has in train and another in test.
+
+    Raises:
+        ValueError: If a part has no rows to train on, the parts differ in channels or in what touch images show, or are
+            the same data, or train of one part and test of another share groups, rows or images.
+
+    Examples:
+        >>> pack = MixedPack({"tag": Pack("packs/tag"), "mine": Pack("packs/mine")})  # doctest: +SKIP
+        >>> pack.column("part")[pack.rows("train")]  # doctest: +SKIP
+    """
+
+    weights: tuple[float, ...] = ()
+    temperature: float = 1.0
+    one_part: bool = False
+
+    def __init__(self, parts: Mapping[str, Pack], *, size: int = 0, allow_leak: bool = False) -> None:
+        self.parts, packs = dict(parts), list(parts.values())
+        _check_parts(parts)
+        self.path, self.meta = Path(" + ".join(str(pack.path) for pack in packs)), {}
+        self.size = size or max(pack.size for pack in packs)
+        self.digests = {name: pack.digest for name, pack in parts.items()} | {"size": digest(self.size)}
+        notes = [
+            f"{name}: images of {pack.size} px are resized to {self.size} px when they are read"
+            for name, pack in parts.items()
+            if pack.size != self.size
+        ]
+        if found := _shared_by_parts(parts):
+            if not allow_leak:
+                raise ValueError(f"{found}: pack them with splits that agree, leave a part out, or give allow_leak")
+            notes.append(found)
+        tasks = _mixed_tasks(parts)
+        self.spec = _mixed_spec(parts, tasks, notes)
+        tables = (pa.table(_mixed_columns(part, parts, tasks[part], self.spec)) for part in parts)
+        self.table = pa.concat_tables(tables, promote_options="permissive")
+        self._open(packs)
+
+    @functools.cached_property
+    def whole(self) -> np.ndarray:
+        return np.concatenate([pack.whole for pack in self.parts.values()])
+
+    @functools.cached_property
+    def hidden(self) -> np.ndarray:
+        return np.concatenate([pack.hidden for pack in self.parts.values()])
+
+    @functools.cached_property
+    def phased(self) -> bool:
+        return any(pack.phased for pack in self.parts.values())
+
+    @functools.cached_property
+    def part_of(self) -> np.ndarray:
+        """int64 [N], number of each row's part."""
+        return np.repeat(np.arange(len(self.parts)), [pack.num for pack in self.parts.values()])
+
+    def shares(self, rows: np.ndarray) -> np.ndarray:
+        """Share [parts] of each part in the rows that training draws from ``rows``."""
+        sizes = np.bincount(self.part_of[rows], minlength=len(self.parts))
+        drawn = np.array(self.weights) if self.weights else sizes**self.temperature * (sizes > 0)
+        return drawn / drawn.sum()
+
+    @property
+    def weighted(self) -> bool:
+        """Whether training draws from the parts otherwise than from one pack of all rows."""
+        return bool(self.weights) or self.temperature != 1 or self.one_part
+
+    def alone(self, part: str) -> Pack:
+        """This pack with the rows of all other parts hidden, and the modalities of ``part``."""
+        inside = self.part_of == list(self.parts).index(part)
+        made = self.with_splits({"split": np.where(inside, self.column("split").astype(str), "hidden")})
+        lacking = {f"{m}_channels": 0 for m in self.spec.modalities if m not in self.parts[part].spec.modalities}
+        made.spec = replace(self.spec, **lacking)
+        return made
 
 
-def columns_of_part(
-    part: str, pack: Pack, taken: Mapping[str, str], prefixed: Mapping[str, str], tasks: Mapping[str, AnyTask]
-) -> Columns:
+def _check_parts(parts: Mapping[str, Pack]) -> None:
+    if len({pack.digest for pack in parts.values()}) < len(parts):
+        raise ValueError(f"two of the parts {', '.join(parts)} are the same data: give each pack once, with a weight")
+    for name, pack in parts.items():
+        if not len(pack.rows("train", "unlabelled")):
+            raise ValueError(f"part {name} ({pack.path}) has no rows in split train or unlabelled: leave it out")
+    for modality in MODALITIES:
+        given = {name: num for name, pack in parts.items() if (num := pack.spec.channels(modality))}
+        if len(set(given.values())) > 1:
+            counts = ", ".join(f"{num} in {name}" for name, num in given.items())
+            raise ValueError(f"{modality} channels differ: {counts}; pack them with the same number of sensors")
+    minus = {pack.spec.difference: name for name, pack in parts.items() if pack.spec.touch_channels}
+    if len(minus) > 1:
+        raise ValueError(f"touch is minus its background in {minus[True]} and not in {minus[False]}: pack both alike")
+
+
+def _shared_by_parts(parts: Mapping[str, Pack]) -> str:
+    """Say what train (or val) of one part and test of another have in common; "" if nothing."""
+    for (a, one), (b, other) in itertools.permutations(parts.items(), 2):
+        learned = one.rows("train", "val", "unlabelled")
+        scored = np.flatnonzero(np.any([other.column(c) == "test" for c in other.spec.split_columns], axis=0))
+        hashes = list(zip(("id", "group"), row_hashes(one), row_hashes(other), strict=True))
+        where = f"is in train of part {a} and in test of part {b}, one of"
+        for column, ours, theirs in hashes[::-1]:
+            both = scored[np.isin(theirs[scored], ours[learned])]
+            if len(both):
+                by = other.spec.group_by if column == "group" else "row"
+                return f"{by} {str(other.column(column)[both[0]])!r} {where} {len(np.unique(theirs[both]))}"
+        if found := _known_image(other, scored, image_sums(one)[learned]):
+            return f"{found[0]} {where} {found[1]}"
+    return ""
+
+
+def _mixed_tasks(parts: Mapping[str, Pack]) -> dict[str, Tasks]:
+    """The tasks of each part. Those of one name that mean the same are one; others become <part>/<name>."""
+    tasks = [task for pack in parts.values() for task in pack.spec.all_tasks]
+    first = {task.name: task for task in reversed(tasks)}
+    shared = {name for name in first if len({_meaning(task) for task in tasks if task.name == name}) == 1}
+    return {
+        part: {t.name: first[t.name] if t.name in shared else _of_part(part, t) for t in pack.spec.all_tasks}
+        for part, pack in parts.items()
+    }
+
+
+def _meaning(task: AnyTask) -> object:
+    """What two tasks must share to be one. Classes may be numbered differently."""
+    asked = frozenset(task.classes) if isinstance(task, Task) else task.targets
+    return type(task), asked, tuple(sorted(task.only.items())), task.split
+
+
+def _of_part(part: str, task: AnyTask) -> AnyTask:
+    own = replace(task, name=f"{part}/{task.name}", only={**task.only, "part": part})
+    if isinstance(own, ValueTask):
+        own = replace(own, targets=tuple(replace(target, name=f"{part}/{target.name}") for target in own.targets))
+    return own
+
+
+def _mixed_spec(parts: Mapping[str, Pack], tasks: Mapping[str, Tasks], notes: Sequence[str]) -> DataSpec:
+    specs = {name: pack.spec for name, pack in parts.items()}
+    every = list({task.name: task for own in tasks.values() for task in own.values()}.values())
+    units = {spec.group_by for spec in specs.values()}
+    controls: dict[str, tuple[str, ...]] = {}
+    for part, name, columns in (
+        (p, name, columns) for p, spec in specs.items() for name, columns in spec.controls.items()
+    ):
+        alike = all(spec.controls.get(name, columns) == columns for spec in specs.values())
+        controls[name if alike else f"{part}/{name}"] = columns
+    return DataSpec(
+        name=f"mix of {', '.join(specs)}",
+        vision_channels=max(spec.vision_channels for spec in specs.values()),
+        touch_channels=max(spec.touch_channels for spec in specs.values()),
+        tasks=tuple(task for task in every if isinstance(task, Task)),
+        values=tuple(task for task in every if isinstance(task, ValueTask)),
+        group_by=units.pop() if len(units) == 1 else "group",
+        controls=controls,
+        licence="; ".join(f"{name}: {spec.licence}" for name, spec in specs.items()),
+        source="; ".join(f"{name}: {spec.source}" for name, spec in specs.items()),
+        notes=(*notes, *(f"{name}: {note}" for name, spec in specs.items() for note in spec.notes)),
+        difference=any(spec.difference for spec in specs.values()),
+    )
+
+
+OWN = re.compile(r"(id|group|touch_group|press|part|sensor|(has|crc|bytes|label)_.*)")
+"""Columns that a mix does not take over as they are."""
+
+
+def _mixed_columns(part: str, parts: Mapping[str, Pack], tasks: Tasks, mixed: DataSpec) -> Columns:
+    """The columns of one part of a mix.
+
+    Ids, groups, touch groups and presses get the prefix ``<part>/``. Column part names the part, column sensor the sensor
+    (the part, if it has no such column). A row has label -1, value NaN and split "hidden" for a task that its part does not
+    have. Other columns are left out where they are numbers in one part and text in another.
+    """
+    pack = parts[part]
+    given = pack.table.column_names
+    kinds = {name: {_kind(p.table, name) for p in parts.values()} - {""} for name in given if not OWN.fullmatch(name)}
+    pressed = ("press",) * all("press" in other.table.column_names for other in parts.values())
+    touch = "touch_group" if "touch_group" in given else "group"
+    prefixed = {"id": "id", "group": "group", "touch_group": touch, **{name: name for name in pressed}}
+    columns: Columns = {f"label_{task.name}": pa.array(np.full(pack.num, -1)) for task in mixed.tasks}
+    columns |= _columns(part, pack, [name for name, found in kinds.items() if len(found) == 1], prefixed, tasks)
+    columns["part"] = _text([part] * pack.num)
+    if "sensor" not in given:
+        columns["sensor"] = columns["part"]
+    filters = {name for task in mixed.all_tasks for name in task.only} - {"part"}
+    columns |= {name: _text(pack.column(name).astype(str)) for name in filters & {*given}}
+    for split in {task.split for task in mixed.all_tasks} - {"split"}:
+        columns[split] = _text(pack.column(split) if split in given else ["hidden"] * pack.num)
+    numbers = [column for used in mixed.controls.values() for column in used]
+    numbers += [target.name for task in mixed.values for target in task.targets]
+    columns |= dict.fromkeys(numbers, pa.array(np.full(pack.num, np.nan)))
+    measured = {column: column for used in pack.spec.controls.values() for column in used}
+    for task in pack.spec.values:
+        own = tasks[task.name]
+        assert isinstance(own, ValueTask)
+        measured |= {new.name: old.name for new, old in zip(own.targets, task.targets, strict=True)}
+    return columns | {new: pa.array(pack.column(old).astype(float)) for new, old in measured.items()}
+
+
+def _kind(table: pa.Table, name: str) -> str:
+    if name not in table.column_names or pa.types.is_null(kind := table.column(name).type):
+        return ""
+    return "number" if pa.types.is_integer(kind) or pa.types.is_floating(kind) else str(kind)
+
+
+class JoinedPack(_Several):
+    """Train and val rows of ``learn`` followed by test rows of ``score``.
+
+    Tasks are those that both packs have, with the classes of ``learn``. ValueError if there is none, or the packs have
+    other image shapes, classes that ``learn`` lacks, or a group or an image in both (test rows would not be unseen).
+
+    Attributes:
+        learn: The first pack; its rows come first.
+    """
+
+    def __init__(self, learn: Pack, score: Pack) -> None:
+        self.path, self.meta, self.learn, self.size = score.path, score.meta, learn, learn.size
+        self.digests = {"learn": learn.digest, "score": score.digest}
+        for modality in MODALITIES:
+            shapes = [(pack.size, pack.spec.channels(modality)) for pack in (learn, score)]
+            if any(num for _, num in shapes) and shapes[0] != shapes[1]:
+                each = [f"{num} channels at {size} px" for size, num in shapes]
+                raise ValueError(
+                    f"{modality} has {each[0]} in {learn.path}, {each[1]} in {score.path}: pack both alike"
+                )
+        tasks = _common_tasks(learn, score)
+        learned = _side(learn, tasks, "learned", {"train", "val"})
+        scored = _side(score, tasks, "scored", {"test"})
+        names = [name for name in learned.column_names if name in scored.column_names]
+        self.table = pa.concat_tables([learned.select(names), scored.select(names)], promote_options="permissive")
+        theirs = score.spec.controls
+        self.spec = replace(
+            learn.spec,
+            name=f"{score.path.name}, probes learned on {learn.path.name}",
+            tasks=tuple(task for task in tasks.values() if isinstance(task, Task)),
+            values=tuple(task for task in tasks.values() if isinstance(task, ValueTask)),
+            controls={name: given for name, given in learn.spec.controls.items() if theirs.get(name) == given},
+            notes=tuple(dict.fromkeys((*learn.spec.notes, *score.spec.notes))),
+        )
+        self._open([learn, score])
+        if found := self._shared():
+            where = f"is learned from in {learn.path} and scored in {score.path}, one of {found[1]}"
+            raise ValueError(f"{found[0]} {where}: give packs whose splits agree")
+
+    def _shared(self) -> tuple[str, int] | None:
+        """A group or an image that probes learn from and are scored on, and how many there are."""
+        groups, sums, by = self.column("group").astype(str), image_sums(self), self.spec.group_by
+        for task in self.spec.all_tasks:
+            learned, scored = (self.rows(*splits, by=task.split) for splits in (("train", "val"), ("test",)))
+            if by != "row" and len(both := np.intersect1d(groups[learned], groups[scored])):
+                return f"{by} {str(both[0])!r}", len(both)
+            if found := _known_image(self, scored, sums[learned]):
+                return found
+        return None
+
+
+def _common_tasks(learn: Pack, score: Pack) -> dict[str, AnyTask]:
+    known = {task.name: task for task in learn.spec.all_tasks}
+    tasks = [(known[task.name], task) for task in score.spec.all_tasks if task.name in known]
+    if not tasks:
+        names = [", ".join(task.name for task in pack.spec.all_tasks) or "none" for pack in (learn, score)]
+        raise ValueError(f"no task is in both packs: {learn.path} has {names[0]}, {score.path} {names[1]}")
+    for ours, theirs in tasks:
+        if isinstance(ours, Task) and isinstance(theirs, Task):
+            theirs = replace(theirs, classes=ours.classes)  # those are compared row by row
+        if _meaning(ours) != _meaning(theirs):
+            raise ValueError(f"task {ours.name!r} has other rows, splits or units in {score.path}")
+    return {ours.name: ours for ours, _ in tasks}
+
+
+def _side(pack: Pack, tasks: Tasks, part: str, keep: set[str]) -> pa.Table:
+    """Return the columns of ``pack`` that probes read; rows of splits other than ``keep`` get the split "hidden"."""
+    plain = ["group", *(f"crc_{modality}" for modality in MODALITIES)]
+    columns = _columns(part, pack, [name for name in plain if name in pack.table.column_names], {"id": "id"}, tasks)
+    columns |= {name: _text(pack.column(name).astype(str)) for task in tasks.values() for name in task.only}
+    numbers = {target.name for task in tasks.values() if isinstance(task, ValueTask) for target in task.targets}
+    numbers |= {column for used in pack.spec.controls.values() for column in used}
+    columns |= {name: pa.array(pack.column(name).astype(float)) for name in numbers}
+    for name in {"split", *(task.split for task in tasks.values())}:
+        columns[name] = _text(s if s in keep else "hidden" for s in pack.table.column(name).to_pylist())
+    return pa.table(columns)
+
+
+def _columns(part: str, pack: Pack, taken: Iterable[str], prefixed: Mapping[str, str], tasks: Tasks) -> Columns:
     """The columns of one part of several.
 
     Args:
         part: Name of the part.
         pack: The part.
-        taken: Its columns that are taken over -> their new names.
+        taken: Its columns that are taken over.
         prefixed: New columns whose cells get the prefix ``<part>/`` -> those of the part.
-        tasks: Its tasks by name -> tasks of all parts, by whose classes labels are numbered.
+        tasks: By whose classes labels are numbered.
     """
-    table: Columns = {new: pack.table.column(own) for own, new in taken.items()}
-    table |= {new: text(f"{part}/{cell}" for cell in pack.column(own).astype(str)) for new, own in prefixed.items()}
-    table["sensor"] = text(np.array(pack.sensor_names)[pack.sensors])
+    columns: Columns = {name: pack.table.column(name) for name in taken}
+    columns |= {new: _text(f"{part}/{cell}" for cell in pack.column(own).astype(str)) for new, own in prefixed.items()}
+    columns["sensor"] = _text(np.array(pack.sensor_names)[pack.sensors])
     for modality in MODALITIES:
         there = pack.has(modality) if modality in pack.spec.modalities else np.zeros(pack.num, bool)
-        table[f"has_{modality}"] = pa.array(there)
+        columns[f"has_{modality}"] = pa.array(there)
     for own in pack.spec.tasks:
         if isinstance(task := tasks.get(own.name), Task):
             numbers = [task.classes.index(name) if name in task.classes else -2 for name in own.classes]
@@ -58,15 +354,15 @@ def columns_of_part(
             if (labels == -2).any():
                 new = next(name for name in own.classes if name not in task.classes)
                 raise unknown(f"class of {task.name}", f"{new} ({pack.path})", task.classes)
-            table[f"label_{task.name}"] = pa.array(labels)
-    return table
+            columns[f"label_{task.name}"] = pa.array(labels)
+    return columns
 
 
-def text(cells: Iterable[str]) -> pa.Array:
+def _text(cells: Iterable[str]) -> pa.Array:
     return pa.array(list(cells), pa.string())
 
 
-def known_image(pack: Pack, rows: np.ndarray, sums: np.ndarray) -> tuple[str, int] | None:
+def _known_image(pack: Pack, rows: np.ndarray, sums: np.ndarray) -> tuple[str, int] | None:
     """The first image of ``rows`` that is among ``sums``, and how many there are of its modality."""
     for same, modality in zip(known_images(pack, rows, sums).T, MODALITIES, strict=True):
         if same.any():

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
+from mvitac.data.several import MixedPack
 from mvitac.data.spec import check_request
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import PackConfig
@@ -45,10 +45,10 @@ class MixConfig(DatasetConfig):
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"part {name!r} is given twice: give each part its own name, NAME=FOLDER")
-        given = {weight is not None for _, _, weight in self.named_parts()}
-        if len(given) > 1:
+        weights = [weight for _, _, weight in self.named_parts()]
+        if any(weights) and not all(weights):
             raise ValueError(f"parts {' '.join(self.parts)}: give every part a weight (NAME=FOLDER:WEIGHT), or none")
-        if True in given and self.temperature != 1:
+        if any(weights) and self.temperature != 1:
             raise ValueError(f"temperature {self.temperature} has no effect on parts with weights: leave one out")
 
     def named_parts(self) -> list[tuple[str, Path, float | None]]:
@@ -58,8 +58,10 @@ class MixConfig(DatasetConfig):
             name, folder, weight = re.fullmatch(r"(?:([\w.-]+)=)?(.*?)(?::([^:/]*))?", text).groups()  # type: ignore
             if not folder:
                 raise ValueError(f"part {text!r} names no folder: give NAME=FOLDER or NAME=FOLDER:WEIGHT")
-            weighs = None if weight is None else _weight(weight, text)
-            found.append((name or Path(folder).resolve().name, Path(folder), weighs))
+            number = None if weight is None else number_of(weight) or 0
+            if number is not None and number <= 0:
+                raise ValueError(f"part {text!r} has weight {weight!r}: give a positive number, or leave it out")
+            found.append((name or Path(folder).resolve().name, Path(folder), number))
         return found
 
     def _frames(self, quiet: bool) -> Pack:
@@ -83,10 +85,3 @@ def open_packs(folders: Sequence[str]) -> Pack:
     if not folders:
         raise ValueError("missing PACK: Folder of the pack, or of several")
     return Pack(folders[0]) if len(folders) == 1 else MixConfig(parts=tuple(folders)).open()
-
-
-def _weight(text: str, part: str) -> float:
-    weight = number_of(text)
-    if weight is None or weight <= 0:
-        raise ValueError(f"part {part!r} has weight {text!r}: give a positive number, or leave the part out")
-    return weight

@@ -9,8 +9,8 @@ from typing import Any
 
 from tabulate import tabulate
 
-from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
+from mvitac.data.several import JoinedPack
 from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig

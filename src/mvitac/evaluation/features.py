@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
+from mvitac.data.several import JoinedPack
 from mvitac.data.spec import MODALITIES
 from mvitac.model import Model
 from mvitac.system.files import cache_dir, digest, write_atomic

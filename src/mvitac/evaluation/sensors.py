@@ -9,9 +9,9 @@ from functools import partial
 
 import numpy as np
 
-from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Pack
+from mvitac.data.several import JoinedPack
 from mvitac.data.spec import listed
 from mvitac.evaluation.features import features, sample
 from mvitac.evaluation.probe_config import Standardise

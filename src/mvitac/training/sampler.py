@@ -6,8 +6,8 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
+from mvitac.data.several import MixedPack
 from mvitac.data.windows import places
 from mvitac.run import Run
 from mvitac.system.distributed import World

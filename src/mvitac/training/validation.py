@@ -14,8 +14,8 @@ import torch
 from scipy.special import stdtrit
 from torch import Tensor
 
-from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
+from mvitac.data.several import MixedPack
 from mvitac.data.spec import AnyTask, Task
 from mvitac.evaluation import diagnostics
 from mvitac.evaluation.features import pack_features

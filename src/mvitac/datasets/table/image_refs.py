@@ -1,4 +1,4 @@
-"""References to images: a file, a frame of a video, a member of a tar, a cell of a parquet table, an array.
+"""References to images: a file, a frame of a video, a cell of a parquet table, an array.
 
 References with the same container (a video, a row group) are read together in one pass. Another format is one more
 class here: its ``container``, how it is ``opened``, and what is ``stored`` there.
@@ -44,10 +44,6 @@ class ImageRef:
     def container(self) -> Hashable | None:
         """Return what is opened once to read many images from it; None if the image is read by itself."""
         return None
-
-    def within(self) -> tuple[int, ...]:
-        """Return the bytes of the file that hold the image, if the table of rows does not determine them."""
-        return ()
 
     @contextmanager
     def opened(self) -> Iterator[Any]:
@@ -98,25 +94,6 @@ class Frame(ImageRef):
         for index, image in video.frames(path, list(at), lost=why):
             yield at[index], Image.fromarray(image)
         lost.update({at[index]: f"{path}: frame {index} {reason}" for index, reason in why.items()})
-
-
-@dataclass(frozen=True, slots=True, order=True)
-class TarMember(ImageRef):
-    """An image file inside an uncompressed tar: ``size`` bytes from ``offset``."""
-
-    offset: int
-    size: int
-
-    def __str__(self) -> str:
-        return f"{self.path} byte {self.offset}"
-
-    def within(self) -> tuple[int, ...]:
-        return self.offset, self.size
-
-    def stored(self, container: Any) -> bytes:
-        with open(self.path, "rb") as file:
-            file.seek(self.offset)
-            return file.read(self.size)
 
 
 @dataclass(frozen=True, slots=True, order=True)

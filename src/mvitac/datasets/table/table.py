@@ -97,7 +97,7 @@ class Rows(Source):
         row_bytes = 3 * config.size**2 * len(self._images)
         self._items = bundles(self._rows, max(1, min(MAX_TOGETHER, MAX_TOGETHER_BYTES // row_bytes)))
         used = [[ref for i in item for ref in self._rows[i].refs()] for item in self._items]
-        self._stamps = [one_stamp((*stamps[ref.path], *ref.within()) for ref in refs) for refs in used]
+        self._stamps = [one_stamp(stamps[ref.path] for ref in refs) for refs in used]
         self._spec = DataSpec(
             name=self._title,
             vision_channels=3 if self._vision else 0,
