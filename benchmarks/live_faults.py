@@ -126,8 +126,7 @@ def fill(disk: Path) -> Path:
 def record_on_a_full_disk(rig: Rig, disk: Path, *, also_at_the_end: bool) -> str:
     """Fill ``disk`` while recording; says what is wrong."""
     out, said = disk / "recording", list[str]()
-    channels = {m: shape[2] for m, shape in frame_shapes(rig.engine).items()}
-    rig.live.record = recorder = Recorder(out, channels, fps=30.0, tell=said.append)
+    rig.live.record = recorder = Recorder(out, fps=30.0, tell=said.append)
     for _ in range(20):
         if not recorder.num:
             rig.run(3)

@@ -79,7 +79,7 @@ def test_only_the_camera_shows_the_slot_and_only_the_gel_the_peg() -> None:
 
 
 def test_demonstrations_are_other_grasps_and_go_astray(small: Insert) -> None:
-    images, actions = small.recorded
+    images, actions = small.shown
     wanted = actions.reshape(5, -1, 2)
     assert np.ptp(wanted, axis=1).max() == 0  # the set point does not change within an episode
     for number in range(5):
@@ -109,10 +109,11 @@ def test_gymnasium_environment() -> None:
     env = gymnasium.make("mvitac/Insert-v1").unwrapped
     check_env(env, skip_render_check=True)
     seen, info = env.reset(seed=1)
-    over = False
+    over, total = False, 0.0
     while not over:
         seen, reward, over, _, info = env.step((info["known"] / env.world.most).astype(np.float32))
-    assert reward == 1 and seen["vision"].shape == seen["touch"].shape and mvitac.control.env.LoopEnv
+        total += reward
+    assert total == 1 and seen["vision"].shape == seen["touch"].shape and mvitac.control.env.LoopEnv
 
 
 def test_a_result_holds_until_it_is_changed(small: Insert, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,7 +137,7 @@ def test_a_result_holds_until_it_is_changed(small: Insert, tmp_path: Path, monke
 def test_regression_finds_what_pictures_show(small: Insert) -> None:
     """From images that are the answer itself, the clone is the expert; shuffled touch takes its half of it away."""
     few = replace(small, episodes=4, demonstrations=(6,))
-    images, actions = few.recorded
+    images, actions = few.shown
     known = {images[sense][row].tobytes(): actions[row] for sense in images for row in range(len(actions))}
 
     def oracle(modality: str, pictures: np.ndarray) -> np.ndarray:

@@ -80,7 +80,7 @@ def test_true_pose_stays_on_and_no_touch_does_not(kind: str) -> None:
         for number in range(8):
             episode = begin(kind, number)
             for _ in range(60):
-                episode.step(-0.5 * (episode.pose - task.target) * known)
+                episode.step(-0.5 * (episode.poses[-1] - task.target) * known)
             errors.append(episode.error[0])
         assert (np.mean(errors) < 0.15) == known
 
@@ -90,10 +90,10 @@ def test_contact_is_lost_beyond_the_limit_and_stays_lost(kind: str) -> None:
     for part in (0.8, 1.3):
         episode = begin(kind, 1)
         limit = episode.task.limit
-        episode.step(episode.task.target + part * limit * (np.arange(len(limit)) == 0) - episode.pose)
+        episode.step(episode.task.target + part * limit * (np.arange(len(limit)) == 0) - episode.poses[-1])
         there, mm, deg = episode.states[-1], *episode.error
         assert episode.lost == (part > 1) and (mm == limit[0]) == (part > 1)
-        episode.step(episode.task.target - episode.pose)
+        episode.step(episode.task.target - episode.poses[-1])
         assert (episode.states[-1] is there) == episode.lost == (part > 1)
         assert not episode.lost or episode.error == (mm, deg) == (limit[0], np.hypot.reduce(limit[1:]))
 
@@ -107,7 +107,7 @@ def test_pictures_show_the_pose_and_repeat() -> None:
     one.step(np.array([1.0, 0.0]))
     assert np.abs(one.look("touch").astype(float) - before).mean() > 1
     late.step(np.array([1.0, 0.0]))
-    assert np.array_equal(late.look("touch"), before) and not np.array_equal(late.known, late.pose)
+    assert np.array_equal(late.look("touch"), before) and not np.array_equal(late.known, late.poses[-1])
     assert not set(textures(True)) & set(textures(False)) and textures(False)
 
 

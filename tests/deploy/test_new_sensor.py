@@ -161,7 +161,7 @@ def test_both_engines_show_the_same(engine: Engine, new: Pack) -> None:
 def test_a_recording_gives_one_image_of_each_touch(engine: Engine, old: Pack, new: Pack, tmp_path: Path) -> None:
     """Frames of one touch are near-copies: they would make the sign look sure. The colours are those of the images."""
     rows = unlabelled_rows(new, 0, 400)
-    recorder = Recorder(tmp_path / "slim", {"vision": 3, "touch": 3}, fps=100.0, sensor="slim")
+    recorder = Recorder(tmp_path / "slim", fps=100.0, sensor="slim")
     play(engine, new, rows, record=recorder)
     assert recorder.close() == 10 * len(rows)
     recording = Pack(tmp_path / "slim")

@@ -9,7 +9,7 @@ from mvitac.cli.options import check_json, parse, printed_to, save_json
 from mvitac.control.ablate import PLAUSIBLE, open_policy, read_episodes, report, suite_episodes, suite_policy
 from mvitac.control.ablate import ablate as compare
 from mvitac.control.result import find_suite, shipped
-from mvitac.control.video import FORMATS, encoded, film
+from mvitac.control.video import film, webp
 from mvitac.data.pack import Pack
 from mvitac.system.progress import shown
 
@@ -19,14 +19,13 @@ class _Options:
     """Does a policy use touch? Replace what it feels and sees in episodes, and compare what it does."""
 
     policy: Positional[str]
-    """module:function or FILE.py:function of an observation, or the folder of a LeRobot policy. In episodes of a suite
-    also an encoder, or "pixels": it learns the task as the suite's rows do."""
+    """FILE.py:function of an observation, or the folder of a LeRobot policy. In episodes of a suite also an encoder, or
+    "pixels": it learns the task as the suite's rows do."""
     data: Path
     """Folder of a pack: its groups are the episodes, and its values "action" what was demonstrated. Or a suite, a task and
     a condition for a closed loop: "insert-v1/both/30", "servo-v1/corner/known sensor"."""
     out: Path | None = None
-    """Of a suite, also write a film of its first episode, with its own and with another's touch: .webp or .gif; or a still
-    of it: .jpg or .png."""
+    """Of a suite, also write a film (.webp) of its first episode, with its own and with another's touch."""
     json: Path | None = None
     """Also write everything that is printed to this file; - = stdout, and the tables to stderr."""
 
@@ -36,8 +35,6 @@ def ablate(argv: list[str]) -> None:
     options = parse(_Options, argv, "ablate")
     check_json(options.json)
     check_json(options.out, "--out")
-    if options.out and options.out.suffix not in FORMATS:
-        raise ValueError(f"--out {options.out} is no film: its name ends with {', '.join(FORMATS)}")
     name, *cell = str(options.data).split("/")
     if name in shipped():
         suite, cell = find_suite(name), tuple(cell)
@@ -51,6 +48,6 @@ def ablate(argv: list[str]) -> None:
         result = compare(policy, episodes)
     if options.out:
         runs = [("as it is", policy, ""), ("touch of another episode", policy, PLAUSIBLE[0])]
-        options.out.write_bytes(encoded(film(episodes, runs), options.out.suffix))
+        options.out.write_bytes(webp(film(episodes, runs)))
     print(report(result), file=printed_to(options.json))
     save_json(options.json, result, sealed=True)

@@ -91,10 +91,9 @@ def live(argv: list[str]) -> None:
     more: Any = {"tell": lambda event: _say(event.text), "free": free, "always": options.always}
     loop, recorder = Live(engine, streams, options.live, **more), None
     if options.record:  # last, for a refusal must leave no spool
-        channels = {m: shape[2] for m, shape in frame_shapes(engine).items()}
-        loop.record = recorder = Recorder(options.record, channels, sensor=sensor, tell=_say)
+        loop.record = recorder = Recorder(options.record, sensor=sensor, tell=_say)
     _run(loop, options.seconds, lambda said: print(json.dumps(said), flush=True))
-    _print_summary(loop.summary())
+    _say(f"summary: {json.dumps(loop.summary())}")
     if options.json:
         write_json(options.json, loop.summary())
     if recorder:  # last, for it may fail (a full disk)
@@ -270,13 +269,3 @@ def _engine(model: str, threads: int, modalities: tuple[Any, ...] = (), *, most:
 
 def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
-
-
-def _print_summary(summary: dict[str, Any]) -> None:
-    if summary["predictions"]:
-        _say("end-to-end age, ms: p50 {p50:.1f}, p99 {p99:.1f}, max {max:.1f}".format(**summary["age_ms"]))
-    _say("{predictions} predictions in {touches} touches; {stale} frames too old to use".format(**summary))
-    for name, s in summary["streams"].items():
-        _say(f"{name}: {s['frames']} frames, {s['dropped']} dropped for newer ones, {s['damaged']} damaged")
-    if summary["events"]:
-        _say("events: " + ", ".join(f"{what} {num}" for what, num in summary["events"].items()))

@@ -12,7 +12,6 @@ Changes are in standard deviations of the action, the mean over its components; 
 recorded episodes is the distance to the demonstrated action, in the same unit; in those of a suite what an episode lost.
 """
 
-import importlib
 import runpy
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -22,12 +21,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from tabulate import tabulate
 
 from mvitac.control.learn import encoding, pixels, ridge
 from mvitac.control.suite import OWN
 from mvitac.data.pack import Pack
 from mvitac.data.windows import places
+from mvitac.datasets.lerobot.reader import FELT
 from mvitac.deploy.artifact import load
 from mvitac.evaluation.intervals import mean_interval
 from mvitac.registry import unknown
@@ -123,7 +124,7 @@ def suite_episodes(suite: Any, cell: tuple[str, ...]) -> Episodes:
 
 def suite_policy(suite: Any, cell: tuple[str, ...], text: str) -> Policy:
     """A policy that ``open_policy`` takes; or that of an encoder, or of "pixels", which learns as rows of the suite do."""
-    if (Path(text) / "config.json").is_file() or (":" in text and not text.startswith("external:")):
+    if _is_lerobot(text) or (":" in text and not text.startswith("external:")):
         return open_policy(text)
     learn = ridge(pixels if text == "pixels" else encoding(load(text)))
     estimate, world = learn(*suite.taught(suite.lesson(cell))), suite.world(*cell, 0)
@@ -131,31 +132,29 @@ def suite_policy(suite: Any, cell: tuple[str, ...], text: str) -> Policy:
 
 
 def open_policy(text: str) -> Policy:
-    """The policy that ``text`` names: module:function, FILE.py:function, or the folder of a LeRobot policy."""
-    if (Path(text) / "config.json").is_file():
+    """The policy that ``text`` names: FILE.py:function, or the folder of a LeRobot policy."""
+    if _is_lerobot(text):
         return lerobot_policy(Path(text))
-    place, _, name = text.rpartition(":")
-    if not place:
-        raise ValueError(f"{text!r} is no policy: give module:function, FILE.py:function or a LeRobot policy's folder")
+    file, _, name = text.rpartition(":")
+    if not file.endswith(".py"):
+        raise ValueError(f"{text!r} is no policy: give FILE.py:function or a LeRobot policy's folder")
     try:
-        module = runpy.run_path(place) if place.endswith(".py") else vars(importlib.import_module(place))
+        return runpy.run_path(file)[name]
     except (Exception, SystemExit) as error:  # whatever the owner's code raises
-        raise ValueError(f"{place} cannot be imported ({type(error).__name__}: {brief(error)})") from None
-    if not callable(found := module.get(name)):
-        raise ValueError(f"{place} has no function {name}")
-    return found
+        raise ValueError(f"{text} cannot be imported ({type(error).__name__}: {brief(error)})") from None
+
+
+def _is_lerobot(text: str) -> bool:
+    return (Path(text) / "config.json").is_file()
 
 
 def lerobot_policy(folder: Path) -> Policy:
     """A LeRobot policy with its own processors. Its cameras that are tactile by their name get touch, the others vision."""
     try:
-        import torch
         from lerobot.configs.policies import PreTrainedConfig  # type: ignore[import-not-found]
         from lerobot.policies.factory import get_policy_class, make_pre_post_processors  # type: ignore[import-not-found]
     except ImportError as error:
         raise ValueError(f"{folder} is a LeRobot policy, and lerobot cannot be imported ({error})") from None
-    from mvitac.datasets.lerobot.reader import FELT
-
     kind = PreTrainedConfig.from_pretrained(folder).type
     policy = get_policy_class(kind).from_pretrained(folder).eval()
     before, after = make_pre_post_processors(policy.config, str(folder))

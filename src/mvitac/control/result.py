@@ -6,6 +6,7 @@
 The row that needs no picture, of the true pose or the expert, is computed again when a result is checked.
 """
 
+import hashlib
 import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -21,7 +22,7 @@ from mvitac.control.ablate import suite_episodes
 from mvitac.control.insert import Insert
 from mvitac.control.servo_rows import Servo
 from mvitac.control.suite import OWN, SHUFFLED, Row, rows_of, score
-from mvitac.control.video import encoded, film
+from mvitac.control.video import film, webp
 from mvitac.evaluation.intervals import paired_difference
 from mvitac.model import Model
 from mvitac.registry import from_json, unknown
@@ -67,7 +68,8 @@ def run_suite(places: Sequence[str], suite: Suite, out: Path, about: About) -> P
                 cells = kept_part(out / "parts", key, known, lambda one=row: score(suite, one))
                 rows.append({"source": row.source, "seed": row.seed, "cells": cells})
                 advance()
-        return {"data": suite.data(), "rows": rows}
+        data = {name: hashlib.sha256(images.tobytes()).hexdigest() for name, images in suite.shown[0].items()}
+        return {"data": data, "rows": rows}
 
     return measure(places, suite, out, about, measured, FORM)
 
@@ -82,13 +84,13 @@ def read_control(path: Path) -> tuple[Suite, dict[str, Any]]:
     """Read and check a result; ValueError if it was changed, is of another definition, lacks a row, or cannot be."""
     value = read_signed(path, FORM)
     with fields_of(path):
-        if value["suite"]["name"] in shipped():
-            suite = find_suite(value["suite"]["name"])
-            if value["suite"] == suite.definition() and value["suite_digest"] == suite.digest():
-                for problem in _problems(value, suite):
-                    raise ValueError(f"{path}: {problem}")
-                return suite, value
-        raise ValueError(f"{path} is not of this version's {value['suite']['name']}: run the suite again")
+        name = value["suite"]["name"]
+        suite = find_suite(name) if name in shipped() else None
+        if not suite or (value["suite"], value["suite_digest"]) != (suite.definition(), suite.digest()):
+            raise ValueError(f"{path} is not of this version's {name}: run the suite again")
+        for problem in _problems(value, suite):
+            raise ValueError(f"{path}: {problem}")
+        return suite, value
 
 
 def _problems(value: dict[str, Any], suite: Suite) -> Iterator[str]:
@@ -105,8 +107,9 @@ def _problems(value: dict[str, Any], suite: Suite) -> Iterator[str]:
         if [(cell["task"], cell["condition"]) for cell in row["cells"]] != suite.cells(row["source"]):
             yield f"{who} has other tasks or conditions than the suite"
         for cell in row["cells"]:
-            sums = np.array([cell[key] for key in suite.sums], float)
-            if not np.isfinite(sums).all() or suite.impossible(cell["task"], np.array(cell["n"]), sums):
+            n, *sums = np.array([cell[key] for key in ("n", *suite.sums)], float)
+            whole = len(n) == suite.num and (n == suite.scored).all() and np.isfinite(sums).all()
+            if not whole or suite.impossible(cell["task"], n, np.array(sums)):
                 yield f"{who}, {cell['task']}, {cell['condition']}: no episodes give these sums"
     true = next(row["cells"] for row in value["rows"] if row["source"] == suite.true)
     for cell, again in zip(true, score(suite, Row(suite.true, None, None)), strict=True):
@@ -178,8 +181,8 @@ def write_page(files: Sequence[Path], out: Path) -> Path:
     sections[0][2].insert(0, page.paragraph(note(suite, values)))
     episodes = suite_episodes(suite, next(cell for cell in suite.cells(OWN) if cell[0] == suite.kinds[2]))
     still = np.zeros(len(episodes.begin[0]().most))
-    data = encoded(film(episodes, [(suite.true, None, ""), ("no action", lambda given: still, "")]), ".webp")
-    image = page.image(data_uri(data, "webp"), "What is seen, and the error in mm and degrees")
+    shown = webp(film(episodes, [(suite.true, None, ""), ("no action", lambda given: still, "")]))
+    image = page.image(data_uri(shown, "webp"), "What is seen, and the error in mm and degrees")
     sections.append(("film", "An episode", [page.figure(image)]))
     text = str(page.page(f"mvitac bench: {suite.name}", head, sections, "Made by mvitac bench board."))
     write_atomic(out, lambda file: file.write(text.encode()))

@@ -10,7 +10,6 @@ The gel is pressed by position, not by force, and the object is rigid. Its dome,
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, ClassVar
@@ -60,10 +59,10 @@ class Shape:
         return -np.where(beyond < roll, beyond * beyond / (2 * roll), beyond - roll / 2)
 
 
-def draw_shape(rng: np.random.Generator, kind: str, kinds: Sequence[str]) -> Shape:
+def draw_shape(rng: np.random.Generator, kind: str, kinds: list[str]) -> Shape:
     """Draw an object of ``kind`` with a texture of one of ``kinds``."""
     feel = Relief(
-        kind=str(rng.choice(list(kinds))),
+        kind=str(rng.choice(kinds)),
         wavelength_mm=float(rng.uniform(0.9, 2.4)),
         irregularity=float(rng.uniform(0.1, 0.6)),
         asperity=float(rng.uniform(-0.8, 0.8)),
@@ -179,13 +178,15 @@ def textured(shape: Shape, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return map_coordinates(shape.texture, places, order=1, mode="mirror")
 
 
-@dataclass(frozen=True)
 class Copy:
-    """One physical sensor: its type, its number, the strength of its LEDs."""
+    """One physical sensor, drawn: a known one, or a copy of the ``new`` one that no probe learned on."""
 
-    sensor: gel.Sensor
-    unit: int
-    gain: float
+    def __init__(self, rng: np.random.Generator, *, new: bool, noise: float = 1.0) -> None:
+        """``noise`` multiplies that of its camera."""
+        choice = [s for s in SENSORS.values() if s.held_out == new]
+        sensor = choice[int(rng.random() * len(choice))]
+        self.gain = float(np.exp(rng.uniform(*np.log((0.5, 1.2)))))
+        self.sensor, self.unit = replace(sensor, noise=sensor.noise * noise), int(rng.integers(2**31))
 
     def touch(self, shape: Shape, state: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """What it sees of a shape: uint8 [64, 64, 3]."""
@@ -200,19 +201,11 @@ class Copy:
         return gel.render(imprint, self.sensor, rng, pixel_mm=pixel, size=SIZE, unit=self.unit, gain=self.gain)
 
 
-def draw_copy(rng: np.random.Generator, *, new: bool, noise: float = 1.0) -> Copy:
-    """Draw a known sensor, or a copy of the one that no probe learned on; ``noise`` multiplies its camera's."""
-    choice = [s for s in SENSORS.values() if s.held_out == new]
-    sensor = choice[int(rng.random() * len(choice))]
-    gain = float(np.exp(rng.uniform(*np.log((0.5, 1.2)))))
-    return Copy(replace(sensor, noise=sensor.noise * noise), int(rng.integers(2**31)), gain)
-
-
-def textures(trained: bool, held_out: int = 5) -> tuple[str, ...]:
-    """Kinds of texture of the shapes that probes are fitted on, or of those that are followed."""
-    kinds = tuple(sorted(KINDS))
-    unseen = kinds[:: len(kinds) // held_out][:held_out]
-    return tuple(kind for kind in kinds if (kind in unseen) != trained)
+def textures(trained: bool) -> list[str]:
+    """Kinds of texture of the shapes that probes are fitted on, or the five of those that are followed."""
+    kinds = sorted(KINDS)
+    unseen = kinds[:: len(kinds) // 5][:5]
+    return [kind for kind in kinds if (kind in unseen) != trained]
 
 
 def presses(name: str, seed: int, each: int, number: int) -> tuple[np.ndarray, np.ndarray]:
@@ -224,7 +217,7 @@ def presses(name: str, seed: int, each: int, number: int) -> tuple[np.ndarray, n
         along = float(rng.uniform(-6, 25))
         asked = task.target + rng.uniform(-1, 1, len(task.target)) * task.reach
         state = _near(task, shape, asked, along)
-        images.append(draw_copy(rng, new=False).touch(shape, state, rng))
+        images.append(Copy(rng, new=False).touch(shape, state, rng))
         poses.append(task.pose(shape, state))
     return np.stack(images), np.stack(poses)
 
@@ -251,5 +244,5 @@ def begun(kind: str, key: tuple[int, ...]) -> tuple[Shape, np.ndarray]:
 def picture(asked: tuple[str, tuple[int, ...], bool, float, np.ndarray, int]) -> np.ndarray:
     """What the sensor of an episode sees at a step: of kind, key, whether it is new, its noise, state and step."""
     kind, key, new, noise, state, step = asked
-    sensor = draw_copy(np.random.default_rng([_TOUCH, *key]), new=new, noise=noise)
+    sensor = Copy(np.random.default_rng([_TOUCH, *key]), new=new, noise=noise)
     return sensor.touch(begun(kind, key)[0], state, np.random.default_rng([_TOUCH, *key, 1 + step]))

@@ -1,6 +1,5 @@
 """The suite ``servo-v1``: one controller follows a shape by a pose that a row estimates, and how far it then is from it."""
 
-import hashlib
 import multiprocessing
 import os
 from collections.abc import Sequence
@@ -78,43 +77,34 @@ class Servo(LoopSuite):
         return next(name for name, task in TASKS.items() if cell[0] in task.kinds)
 
     def taught(self, lesson: str) -> Lesson:
-        images, poses = self.presses[lesson]
-        return {"touch": images}, poses, self.fit_val * self.fit_presses
+        images, poses = self.shown
+        return {"touch": images[lesson]}, poses[lesson], self.fit_val * self.fit_presses
 
     @cached_property
-    def presses(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Images and poses of each task, rendered once for all rows."""
-        found = {}
+    def shown(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Images and poses of the presses of each task, rendered once for all rows."""
+        images, poses = {}, {}
         for name in TASKS:
             made = _processes().map(partial(presses, name, self.seed, self.fit_presses), range(self.fit_shapes))
-            images, poses = (np.concatenate(parts) for parts in zip(*made, strict=True))
-            found[name] = images, poses
-        return found
-
-    def data(self) -> dict[str, str]:
-        """Digests of the presses."""
-        return {name: hashlib.sha256(images.tobytes()).hexdigest() for name, (images, _) in self.presses.items()}
+            images[name], poses[name] = (np.concatenate(parts) for parts in zip(*made, strict=True))
+        return images, poses
 
     def look(self, worlds: Sequence[Any], sense: str) -> np.ndarray:
         return np.stack(list(_processes().map(picture, [world.moment for world in worlds], chunksize=5)))
 
     def impossible(self, task: str, n: np.ndarray, sums: np.ndarray) -> bool:
         """Whether no episodes give these sums [3, shapes]: steps without contact have the limit."""
-        mm, deg, lost = sums
-        most, fits = task_of(task).limit, (n == self.scored).all() and n.shape == mm.shape
-        fits &= len(n) == self.shapes and (lost >= 0).all() and (lost == lost.round()).all()
-        for each, limit in ((mm, most[0]), (deg, np.hypot.reduce(most[1:]))):
-            fits &= bool((each >= lost * limit - 1e-6).all() and (each <= n * limit + 1e-6).all())
-        return not fits
+        limit, lost = task_of(task).limit, sums[2]
+        most = np.array([limit[:1], [np.hypot.reduce(limit[1:])]])
+        inside = (sums[:2] >= lost * most - 1e-6) & (sums[:2] <= n * most + 1e-6)
+        return not (inside.all() and (lost >= 0).all() and (lost == lost.round()).all())
 
     def text(self, cells: Sequence[dict[str, Any]]) -> str:
         """A cell of a table, of those of all seeds."""
         mm, deg, lost = (np.array([cell[key] for cell in cells]) / cells[0]["n"] for key in self.sums)
         mean, low, high = np.clip(mean_interval(mm)[:3], 0, task_of(cells[0]["task"]).limit[0])
-        share = 100 * lost.mean()
-        return f"{mean:.2f} [{low:.2f}, {high:.2f}] mm, {deg.mean():.1f}°" + (
-            f", {share:.0f} % lost" if share >= 0.5 else ""
-        )
+        share = f", {100 * lost.mean():.0f} % lost" if lost.mean() >= 0.005 else ""
+        return f"{mean:.2f} [{low:.2f}, {high:.2f}] mm, {deg.mean():.1f}°{share}"
 
 
 class Episode:
@@ -124,53 +114,35 @@ class Episode:
 
     def __init__(self, suite: Servo, kind: str, condition: Condition, number: int) -> None:
         self.suite, self.kind, self.condition, self.task = suite, kind, condition, task_of(kind)
-        self.key = suite.seed, 1 + suite.kinds.index(kind), number
+        self.key, self.most = (suite.seed, 1 + suite.kinds.index(kind), number), suite.most * self.task.limit
         self.shape, first = begun(kind, self.key)
-        self.states, self.lost, self.sums = [first], False, np.zeros(3)
-        self.most = suite.most * self.task.limit
+        self.states: list[np.ndarray] = []
+        self.poses: list[np.ndarray] = []
+        self.lost, self.sums = False, np.zeros(3)
+        self._go(first)
 
-    @property
-    def pose(self) -> np.ndarray:
-        return self.task.pose(self.shape, self.states[-1])
-
-    @property
-    def shown(self) -> int:
-        """The step that is seen now."""
-        return max(0, len(self.states) - 1 - self.condition.latency_ms // STEP_MS)
-
-    @property
-    def moment(self) -> Any:
-        """What ``servo.picture`` takes."""
-        condition = self.condition
-        return self.kind, self.key, condition.new_sensor, condition.noise, self.states[self.shown], self.shown
-
-    @property
-    def values(self) -> dict[str, np.ndarray]:
-        return {"state": np.array([STEP_MM * (len(self.states) - 1)])}
-
-    @property
-    def known(self) -> np.ndarray:
-        return self.task.pose(self.shape, self.states[self.shown])
-
-    @property
-    def over(self) -> bool:
-        return len(self.states) > self.suite.steps
+    def _go(self, state: np.ndarray) -> None:
+        """Be there. What is seen and known is of some steps before."""
+        self.states.append(state)
+        self.poses.append(self.task.pose(self.shape, state))
+        self.lost |= bool((np.abs(self.poses[-1] - self.task.target) > self.task.limit).any())
+        steps, condition = len(self.states) - 1, self.condition
+        if steps > self.suite.settle:
+            self.sums += (*self.error, self.lost)
+        self.over, self.values = steps >= self.suite.steps, {"state": np.array([STEP_MM * steps])}
+        shown = max(0, steps - condition.latency_ms // STEP_MS)
+        self.known = self.poses[shown]
+        self.moment = self.kind, self.key, condition.new_sensor, condition.noise, self.states[shown], shown
 
     @property
     def error(self) -> tuple[float, float]:
         """Distance from the target; the limits once contact is lost."""
-        away = self.task.limit if self.lost else np.abs(self.pose - self.task.target)
+        away = self.task.limit if self.lost else np.abs(self.poses[-1] - self.task.target)
         return float(away[0]), float(np.hypot.reduce(away[1:]))
 
     @property
     def loss(self) -> float:
         return self.sums[0] / self.suite.scored
-
-    @property
-    def reward(self) -> float:
-        """Minus the error, in parts of the limit."""
-        mm, deg = self.error
-        return -float(mm / self.task.limit[0] + deg / np.hypot.reduce(self.task.limit[1:]))
 
     def look(self, sense: str) -> np.ndarray:
         return picture(self.moment)
@@ -179,11 +151,7 @@ class Episode:
         return np.clip(-self.suite.gain * (estimate - self.task.target), -self.most, self.most)
 
     def step(self, action: np.ndarray) -> None:
-        state = self.states[-1] if self.lost else self.task.moved(self.shape, self.states[-1], action)
-        self.states.append(state)
-        self.lost |= bool((np.abs(self.pose - self.task.target) > self.task.limit).any())
-        if len(self.states) - 1 > self.suite.settle:
-            self.sums += (*self.error, self.lost)
+        self._go(self.states[-1] if self.lost else self.task.moved(self.shape, self.states[-1], action))
 
     def result(self) -> tuple[float, ...]:
         return tuple(self.sums)

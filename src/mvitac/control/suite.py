@@ -8,7 +8,7 @@ A suite makes *worlds*, episodes that begin, of a task under a condition:
 
 ``look(sense)``, uint8 [64, 64, 3], and ``values`` are all that a policy gets. ``known`` is the truth about what a row
 estimates, ``answer`` the action that an estimate leads to, ``most`` the largest action. ``error`` is that of now, in mm and
-degrees, ``reward`` that of the last step, ``loss`` and ``result()``, the suite's sums, are those of the episode.
+degrees, ``loss`` and ``result()``, the suite's sums, are those of the episode.
 """
 
 from collections.abc import Sequence

@@ -10,8 +10,7 @@ from PIL import Image, ImageDraw
 
 from mvitac.control.ablate import Episodes, Policy, act
 
-SIDE, MOMENTS = 144, 3
-FORMATS = {".webp": "webp", ".gif": "gif", ".jpg": "jpeg", ".png": "png"}
+SIDE = 144
 Run = tuple[str, Policy | None, str]  # title, policy (None: who knows the truth), what replaces touch
 
 
@@ -50,12 +49,8 @@ def _trace(
         draw.line([(at[0] + 6 + (SIDE - 12) * x / len(errors), float(each)) for x, each in enumerate(y)], colour, 2)
 
 
-def encoded(pictures: Sequence[Image.Image], suffix: str) -> bytes:
-    """The film as a file with this suffix: .webp or .gif, or a still of some moments."""
+def webp(pictures: Sequence[Image.Image]) -> bytes:
+    """The film as a WebP file, ten steps a second."""
     buffer = io.BytesIO()
-    if suffix in (".webp", ".gif"):
-        pictures[0].save(buffer, FORMATS[suffix], save_all=True, append_images=pictures[1:], duration=100, loop=0)
-    else:
-        some = [pictures[i] for i in np.linspace(0, len(pictures) - 1, MOMENTS).round().astype(int)]
-        Image.fromarray(np.hstack([np.asarray(each) for each in some])).save(buffer, FORMATS[suffix])
+    pictures[0].save(buffer, "webp", save_all=True, append_images=pictures[1:], duration=100, loop=0)
     return buffer.getvalue()

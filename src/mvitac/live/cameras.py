@@ -124,10 +124,7 @@ class Video(Recording):
 
     def open(self) -> None:
         if self.number < 0:
-            try:
-                self.times = frame_times(self.path)
-            except ValueError as error:
-                raise OSError(brief(error)) from None
+            self.times = frame_times(self.path)
             self.fps = float(1 / np.median(np.diff(self.times))) if len(self.times) > 1 else 30.0
         self.number, self.lost = -1, {}
         self.left = frames(self.path, range(len(self.times)), lost=self.lost)
@@ -252,6 +249,6 @@ def recording(text: str) -> Recording:
     files.crop = crop
     try:  # now: unlike a camera, a missing file does not come back
         files.open()
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise ValueError(f"source {text!r}: {brief(error)}") from None
     return files

@@ -9,10 +9,9 @@ Shapes: frames uint8 RGB [H, W, 3].
 
 import math
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -30,9 +29,6 @@ NUM_AGES = 10_000
 class Touch:
     """One touch, from contact to release, with the sum of its predictions."""
 
-    number: int
-    start: float
-    end: float | None = None
     num_frames: int = 0
     totals: dict[str, np.ndarray] = field(default_factory=dict)
     values: dict[str, np.ndarray] = field(default_factory=dict)  # task -> values [T] of the newest frame
@@ -42,19 +38,6 @@ class Touch:
         for task, p in probabilities.items():
             self.totals[task] = self.totals.get(task, 0) + p
         self.values = values
-
-    def answer(self, task: str, classes: Sequence[str]) -> tuple[str, float]:
-        """The likeliest class so far, and its mean probability."""
-        mean = self.totals[task] / self.num_frames
-        return classes[int(mean.argmax())], float(mean.max())
-
-
-def _contacts(touch: Sequence[Stream], free: Sequence[np.ndarray], config: LiveConfig, side: int) -> dict[str, Contact]:
-    """The contact detector of each touch sensor by its name."""
-    if len(free) not in (0, len(touch)):
-        raise ValueError(f"{len(free)} background(s) for {len(touch)} touch sensor(s): give one of each, or none")
-    pairs = zip_longest(touch, [s.origin.cropped(image) for s, image in zip(touch, free, strict=False)])
-    return {stream.name: Contact(config, side, image) for stream, image in pairs if stream}
 
 
 class Live:
@@ -89,21 +72,27 @@ class Live:
         given = {m: len(several) for m, several in streams.items()}
         if given != (wanted := {m: shape[2] // 3 for m, shape in frame_shapes(engine).items()}):
             raise ValueError(f"number of sources: the model takes {wanted}, given are {given}")
-        self.engine, self.streams, self.config, self.clock = engine, streams, config, clock
+        self.engine, self.streams, self.clock = engine, streams, clock
         self.record, self.tell, self.always = record, tell, always
         self.all = [s for several in streams.values() for s in several]
-        self.leading = (streams.get("touch") or streams["vision"])[0]  # the stream whose new frames start predictions
-        _check_window(engine)
+        self._leads = "touch" if "touch" in streams else "vision"
+        self.leading = streams[self._leads][0]  # the stream whose new frames start predictions
         window = engine.window or {"minus_first": False}
+        if window["minus_first"] and (engine.difference or "vision" in window["of"]):
+            raise ValueError("live learns the background of touch alone: not that of vision, nor frames minus it twice")
         self.minus_rest = engine.difference or (window["minus_first"] and "touch" in window["of"])
         """Whether the learned background is subtracted from touch. It also stands for the first frame of a touch."""
         side = engine.inputs["touch"][0] if self.minus_rest and "touch" in streams else 0
         self._since: dict[str, float] = {}
-        self.contacts = _contacts(streams.get("touch", ()), free, config, side)
+        felt = streams.get("touch", ())
+        if len(free) not in (0, len(felt)):
+            raise ValueError(f"{len(free)} background(s) for {len(felt)} touch sensor(s): give one of each, or none")
+        shown = [s.origin.cropped(image) for s, image in zip(felt, free, strict=True)] if free else [None] * len(felt)
+        self.contacts = {s.name: Contact(config, side, image) for s, image in zip(felt, shown, strict=True)}
         self.counts: Counter[str] = Counter()
-        self._ages = np.zeros(NUM_AGES)
-        self.age = self.max_age = 0.0
-        """Seconds from the capture of the leading frame to the answer: of the latest prediction, and the maximum."""
+        self.ages: deque[float] = deque(maxlen=NUM_AGES)
+        """Seconds from the capture of the leading frame to the answer, the latest prediction's last."""
+        self.max_age = 0.0
         self.num_predictions = self.num_stale = self.num_touches = 0
         self.touch: Touch | None = None
         self.last: Touch | None = None
@@ -127,21 +116,21 @@ class Live:
         leading = self.leading.newest(take=False)
         if leading is None or leading.number == self._seen:
             if any(stream.fault for stream in self.all):
-                self._lose(self.clock())
+                self._lose()
             return False
         frames = {m: [s.newest() for s in several] for m, several in self.streams.items()}
         # A newer frame may have come since ``leading`` was read: the one that is used counts.
-        self._seen = (frames[self._leading_modality][0] or leading).number
+        self._seen = (frames[self._leads][0] or leading).number
         now = self.clock()
         if not self._all_fresh(frames, now):
             self.num_stale += 1
-            self._lose(now)
+            self._lose()
             return False
         images, given = self.see({m: [frame for frame in found if frame] for m, found in frames.items()})
         if not self.contact:
-            self._release(now)
+            self.finish()
         if given:
-            self._predict(given, min(f.time for f in frames[self._leading_modality] if f), now)
+            self._predict(given, min(f.time for f in frames[self._leads] if f))
         if self.record:
             self.record(images, {"time": now, "contact": bool(self.contact), "touch_number": self.num_touches})
         return given is not None
@@ -178,30 +167,23 @@ class Live:
             for stream, frame in zip(several, found, strict=True)
         )
 
-    def _predict(self, given: dict[str, np.ndarray], captured: float, now: float) -> None:
+    def _predict(self, given: dict[str, np.ndarray], captured: float) -> None:
         """Add a prediction from what the model gets to the current touch, or start one."""
-        if not self.contact:
-            self.answer = Touch(self.num_touches, now)
-        elif self.touch is None:
-            self.touch = self.answer = Touch(self.num_touches, now)
-        assert self.answer
+        self.answer = self.touch or Touch()
+        if self.contact:
+            self.touch = self.answer
         self.outputs = outputs = self.engine(**{m: image[None] for m, image in given.items()})
         self.answer.add(
             {task: outputs[f"probability_{task}"][0] for task in self.engine.classes},
             {task: outputs[f"value_{task}"][0] for task in self.engine.values},
         )
-        self.age = self.clock() - captured
-        self._ages[self.num_predictions % NUM_AGES] = self.age
-        self.max_age = max(self.max_age, self.age)
+        self.ages.append(self.clock() - captured)
+        self.max_age = max(self.max_age, self.ages[-1])
         self.num_predictions += 1
 
     def finish(self) -> None:
-        """End the current touch: no more frames will come."""
-        self._release(self.clock())
-
-    @property
-    def _leading_modality(self) -> str:
-        return "touch" if self.streams.get("touch") else "vision"
+        """End the current touch."""
+        self.last, self.touch, self.answer = self.touch or self.last, None, None
 
     def _contact(self, frames: Sequence[Frame]) -> bool | None:
         """Whether any touch sensor is in contact; None during calibration; always True without a sensor."""
@@ -218,9 +200,9 @@ class Live:
             contact(frame.image)
             if contact.uneasy and not before[1]:
                 text = f"{name} was touched or moved while its background was learned: release it, it is learned again"
-                self._heard(Event(self.clock(), name, "uneasy calibration", text))
+                self._heard(Event(name, "uneasy calibration", text))
             if before[0] and contact.background is not None:
-                self._heard(Event(self.clock(), name, "calibrated", f"{name} is calibrated without contact"))
+                self._heard(Event(name, "calibrated", f"{name} is calibrated without contact"))
         states = self.contacts.values()
         return None if any(c.background is None for c in states) else any(c.touched for c in states)
 
@@ -252,16 +234,10 @@ class Live:
         free = np.concatenate([c.picture for c in self.contacts.values() if c.picture is not None], axis=2)
         return [difference(frame, np.rint(free).astype(np.uint8)) for frame in frames]
 
-    def _lose(self, now: float) -> None:
+    def _lose(self) -> None:
         """End the touch when frames are missing: contact is then unknown."""
-        self._release(now)
+        self.finish()
         self.contact = None
-
-    def _release(self, now: float) -> None:
-        self.answer = None
-        if self.touch is not None:
-            self.touch.end = now
-            self.last, self.touch = self.touch, None
 
     def _heard(self, event: Event) -> None:
         self.counts[event.what] += 1
@@ -271,18 +247,17 @@ class Live:
         if event.what in ("resolution changed", "back") and event.stream in self.contacts:
             self._changed.add(event.stream)
 
-    def answers(self, touch: Touch | None) -> dict[str, tuple[str, float]]:
-        """(class, confidence) by task of a touch."""
-        if touch is None or not touch.num_frames:
-            return {}
-        return {task: touch.answer(task, classes) for task, classes in self.engine.classes.items()}
+    def answers(self, touch: Touch) -> dict[str, tuple[str, float]]:
+        """By task the likeliest class of a touch, and its mean probability."""
+        means = {task: touch.totals[task] / touch.num_frames for task in self.engine.classes}
+        return {task: (self.engine.classes[task][int(p.argmax())], float(p.max())) for task, p in means.items()}
 
     def prediction(self) -> dict[str, Any]:
         """The newest prediction, JSON-ready; without contact, that alone (unless ``always``)."""
         said: dict[str, Any] = {"touch": self.num_touches, "contact": self.contact if self.answer else False}
         if self.answer is None:
             return said
-        said["age_ms"] = 1000 * self.age
+        said["age_ms"] = 1000 * self.ages[-1]
         for task, (name, confidence) in self.answers(self.answer).items():
             said[task] = {"class": name, "confidence": confidence}
         for task, targets in self.engine.values.items():
@@ -292,22 +267,14 @@ class Live:
 
     def summary(self) -> dict[str, Any]:
         """Counts, ages in ms from capture to prediction, and events, JSON-ready."""
-        ages = 1000 * self._ages[: self.num_predictions]
-        p50, p99 = (float(np.percentile(ages, q)) if len(ages) else None for q in (50, 99))
+        p50, p99 = (1000 * float(np.percentile(self.ages, q)) if self.ages else None for q in (50, 99))
         return {
             "predictions": self.num_predictions,
             "touches": self.num_touches,
-            "age_ms": {"p50": p50, "p99": p99, "max": 1000 * self.max_age if len(ages) else None},
+            "age_ms": {"p50": p50, "p99": p99, "max": 1000 * self.max_age if self.ages else None},
             "stale": self.num_stale,
             "streams": {
                 s.name: {"frames": s.num_frames, "dropped": s.num_dropped, "damaged": s.num_damaged} for s in self.all
             },
             "events": dict(self.counts),
         }
-
-
-def _check_window(engine: Engine) -> None:
-    """ValueError if the model looks at differences that live input does not have."""
-    window = engine.window
-    if window and window["minus_first"] and (engine.difference or "vision" in window["of"]):
-        raise ValueError("live learns the background of touch alone: not that of vision, nor frames minus it twice")

@@ -6,6 +6,7 @@ After a crash the spool stays, and ``finish`` makes the pack.
 import io
 import shutil
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,7 @@ import numpy as np
 from mvitac.data.build import build
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec
-from mvitac.registry import from_json, to_json
-from mvitac.system.files import check_place, digest_file, read_json, write_atomic, write_json
+from mvitac.system.files import check_place, digest_file, write_atomic
 
 SPOOL = 64  # pairs per file of the spool: the number that a crash can lose
 
@@ -27,40 +27,28 @@ class Recorder:
     """
 
     def __init__(
-        self,
-        out: Path,
-        channels: dict[str, int],
-        *,
-        fps: float = 10.0,
-        sensor: str = "",
-        tell: Callable[[str], object] = print,
+        self, out: Path, *, fps: float = 10.0, sensor: str = "", tell: Callable[[str], object] = print
     ) -> None:
-        """Record into the new folder ``out``.
-
-        Args:
-            channels: modality -> C of its images, uint8 [S, S, C].
-            fps: Maximum number of pairs per second.
-            sensor: Name of the touch sensor, if it is known (column sensor).
-        """
+        """Record into the new folder ``out``; ``sensor`` is the touch sensor's name, if it is known (column sensor)."""
         if out.exists():
             raise ValueError(f"{out} already exists: choose another --record, or delete it first")
         check_place(out)
         self.out, self.every, self.tell, self.failed = out, 1 / fps, tell, False
+        self.named = {"sensor": sensor} if sensor else {}
         self.spool = _spool(out)
         if self.spool.exists():
             how = f'python -c "from mvitac.live.recorder import finish; finish({str(out)!r})"'
             raise ValueError(f"{self.spool} is of a recording that still runs, or crashed and is finished by {how}")
-        channels = {f"{m}_channels": channels.get(m, 0) for m in ("vision", "touch")}
-        about = {"name": "recording", "group_by": "contact", "source": "mvitac live"}
-        spec = DataSpec(**about, **channels, tasks=(), licence="as the one who recorded it decides")  # type: ignore[arg-type]
         self.spool.mkdir(parents=True)
-        write_json(self.spool / "recording.json", {"spec": to_json(spec), "sensor": sensor}, sealed=True)
         self.waiting: list[tuple[dict[str, np.ndarray], dict[str, Any]]] = []
         self.num = 0
         self._next = float("-inf")
 
     def __call__(self, images: dict[str, np.ndarray], columns: dict[str, Any]) -> None:
-        """Keep one pair if the last one is long enough ago; ``columns`` has at least time, contact and touch_number."""
+        """Keep one pair (uint8 [S, S, C] by modality) if the last one is long enough ago.
+
+        ``columns`` has at least time, contact and touch_number.
+        """
         time = columns["time"]
         if time < self._next or self.failed:
             return
@@ -69,7 +57,7 @@ class Recorder:
         self._next += self.every
         if time >= self._next:
             self._next = time + self.every
-        self.waiting.append((images, columns))
+        self.waiting.append((images, {**columns, **self.named}))
         if len(self.waiting) == SPOOL:
             try:
                 self._flush()
@@ -80,8 +68,9 @@ class Recorder:
     def _flush(self) -> None:
         if not self.waiting:
             return
-        arrays = {m: np.stack([images[m] for images, _ in self.waiting]) for m in self.waiting[0][0]}
-        columns = {f"column_{name}": np.array([c[name] for _, c in self.waiting]) for name in self.waiting[0][1]}
+        pairs, rows = zip(*self.waiting, strict=True)
+        arrays = {m: np.stack([images[m] for images in pairs]) for m in pairs[0]}
+        columns = {f"column_{name}": np.array([row[name] for row in rows]) for name in rows[0]}
         buffer = io.BytesIO()
         np.savez(buffer, **arrays, **columns)  # type: ignore[arg-type]
         write_atomic(self.spool / f"{self.num:08d}.npz", lambda file: file.write(buffer.getvalue()))
@@ -102,7 +91,7 @@ def finish(out: str | Path) -> int:
     """Make ``out`` from its spool, which is then deleted; returns its number of pairs (0: nothing is made)."""
     spool, num = Recorded(_spool(Path(out))), 0
     if spool.files:  # none after a crash before the first
-        num = build(spool, Path(out), size=spool.size(), quiet=True).num
+        num = build(spool, Path(out), size=next(reversed(spool.shapes.values()))[0], quiet=True).num
     shutil.rmtree(spool.path)
     return num
 
@@ -111,17 +100,18 @@ class Recorded(Source):
     """A spool as the source of a pack; each of its files is an item."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.files = sorted(path.glob("*.npz"))
-        meta = read_json(path / "recording.json", "an unfinished recording")
-        self._spec = meta["spec"]
-        self.named = {"sensor": meta["sensor"]} if meta["sensor"] else {}
+        self.path, self.files = path, sorted(path.glob("*.npz"))
+
+    @cached_property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Of the images, [S, S, C], by modality."""
+        with np.load(self.files[0], allow_pickle=False) as part:
+            return {m: part[m].shape[1:] for m in ("vision", "touch") if m in part.files}
 
     def spec(self) -> DataSpec:
-        return from_json(DataSpec, self._spec, "spec")
-
-    def size(self) -> int:
-        return next(len(s.touch if s.touch is not None else s.vision) for s in self.read(0))  # type: ignore[arg-type]
+        channels: Any = {f"{m}_channels": self.shapes.get(m, (0,))[-1] for m in ("vision", "touch")}
+        about: Any = {"name": "recording", "group_by": "contact", "source": "mvitac live", "tasks": ()}
+        return DataSpec(**about, **channels, licence="as the one who recorded it decides")
 
     def items(self) -> Sequence[str]:
         return [path.name for path in self.files]
@@ -142,7 +132,7 @@ class Recorded(Source):
             own: dict[str, Any] = {name: values[i] for name, values in columns.items()}
             # Frames of one touch are near-copies, so each touch is a group; so is each rest between touches.
             group = f"{'touch' if own['contact'] else 'rest'}-{own['touch_number']:06d}"
-            own |= {"id": f"{first + i:08d}", "group": group, "touch_group": group, "split": "unlabelled", **self.named}
+            own |= {"id": f"{first + i:08d}", "group": group, "touch_group": group, "split": "unlabelled"}
             vision, touch = (arrays[m][i] if m in arrays else None for m in ("vision", "touch"))
             samples.append(Sample(vision=vision, touch=touch, columns=own))
         return samples

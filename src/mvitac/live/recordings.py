@@ -5,7 +5,7 @@ far), if the sensor was seen without contact; of a pack ``id``, ``group`` and ``
 ``answers``.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import islice
 from typing import Any
@@ -86,25 +86,24 @@ class Recordings:
             ValueError: The engine takes others, or needs the sensor without contact, which is nowhere to be seen.
         """
         self.engine, self.left_out = engine, 0
-        self.files: dict[Stream, Recording] = {}
-        streams: dict[str, Sequence[Stream]] = {}
-        for modality, several in files.items():
-            for file in several:
-                file.open()
-            streams[modality] = [Stream(f"{modality} {i}", f, clock=_time(f)) for i, f in enumerate(several)]
-            self.files |= dict(zip(streams[modality], several, strict=True))
+        streams: Any = {
+            m: [Stream(f"{m} {i}", file, clock=lambda file=file: file.time) for i, file in enumerate(several)]
+            for m, several in files.items()
+        }
         self.live = Live(engine, streams, config, free=free, always=True)
-        self.calibrated = all(self._calibrate(stream) for stream in streams.get("touch", ()))
+        self.pairs: list[tuple[Any, Recording]] = [(s, s.origin) for several in streams.values() for s in several]
+        self.leading: Any = self.live.leading.origin
+        self.calibrated = all(self._calibrate(stream.name, stream.origin) for stream in streams.get("touch", ()))
         if self.live.minus_rest and not self.calibrated:
             num = config.calibration
             raise ValueError(
                 f"the model needs the sensor without contact, and no {num} frames show it: give --background"
             )
-        self.num = len(self.files[self.live.leading].times)
+        self.num = len(self.leading.times)
 
-    def _calibrate(self, stream: Stream) -> bool:
+    def _calibrate(self, name: str, file: Recording) -> bool:
         """Learn the background of a touch sensor from its first frames, or the first without contact."""
-        contact, file = self.live.contacts[stream.name], self.files[stream]
+        contact = self.live.contacts[name]
         while contact.background is None and file.number + 1 < len(file.times):
             with suppress(ValueError):  # a damaged frame
                 contact(file.cropped(file.read()))
@@ -113,29 +112,25 @@ class Recordings:
 
     def tables(self) -> Iterator[Table]:
         """Tables of up to ``BATCH`` frames; the next are read while the engine computes."""
-        for numbers, times, contact, touch, images in prefetch(self._batches()):
+        rows = self._rows()
+        batches = iter(lambda: [*zip(*islice(rows, BATCH), strict=True)], [])
+        for numbers, times, contact, touch, images in prefetch(batches):
             table = {"frame": numbers, "time": np.round(times, 6)}
             if self.live.contacts and self.calibrated:
                 table |= {"contact": contact, "touch": touch}
             given = {m: np.stack([each[m] for each in images]) for m in self.engine.inputs}
             yield table | answers(self.engine, self.engine(**given))
 
-    def _batches(self) -> Iterator[tuple[Any, ...]]:
-        rows = self._rows()
-        while batch := list(islice(rows, BATCH)):
-            yield tuple(zip(*batch, strict=True))
-
     def _rows(self) -> Iterator[tuple[int, float, bool | None, int, dict[str, np.ndarray]]]:
         """Number, time, contact and touch of each frame, and what the model gets of it."""
-        leading = self.live.leading
-        for number, time in enumerate(self.files[leading].times.tolist()):
-            for stream, file in self.files.items():
-                while file.number < 0 or (file.number < number if stream is leading else _nearer(file, time)):
+        for number, time in enumerate(self.leading.times.tolist()):
+            for stream, file in self.pairs:
+                while file.number < 0 or (file.number < number if file is self.leading else _nearer(file, time)):
                     with suppress(ValueError):  # a damaged frame
                         stream.take(file.cropped(file.read()))
             newest = {m: [stream.newest() for stream in several] for m, several in self.live.streams.items()}
             apart = [abs(f.time - time) if f else np.inf for several in newest.values() for f in several]
-            found, given = leading.newest(), None
+            found, given = self.live.leading.newest(), None
             if max(apart) <= TOGETHER and found and found.time == time:
                 self.live.remember()
                 _, given = self.live.see(newest)  # type: ignore[arg-type]
@@ -143,10 +138,6 @@ class Recordings:
                 self.left_out += 1
                 continue
             yield number, time, self.live.contact, self.live.num_touches, given
-
-
-def _time(file: Recording) -> Callable[[], float]:
-    return lambda: file.time
 
 
 def _nearer(file: Recording, time: float) -> bool:

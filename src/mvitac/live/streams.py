@@ -36,7 +36,6 @@ class Frame:
 class Event:
     """A fault or its end: ``what`` is the kind, ``text`` the sentence for the user."""
 
-    time: float
     stream: str
     what: str
     text: str
@@ -140,12 +139,12 @@ class Stream:
         """Make ``image`` the newest frame, captured when its source says, or now."""
         now, before = self.clock(), self._newest
         captured = now if self.origin.captured is None else self.origin.captured
-        changed = before is not None and before.image.shape != image.shape
+        changed = before and before.image.shape != image.shape
         if self.fault in ("unplugged", "stalled"):
             self._recovered()
-        if changed:
-            assert before
-            self._say("resolution changed", f"changed from {_shape(before.image)} to {_shape(image)}")
+        if before and changed:
+            old, new = (f"{x.shape[1]}x{x.shape[0]}" for x in (before.image, image))
+            self._say("resolution changed", f"changed from {old} to {new}")
         if before is None or changed or not np.array_equal(before.image, image):
             if self.fault == "frozen":
                 self._recovered()
@@ -179,11 +178,7 @@ class Stream:
     def _say(self, what: str, text: str) -> None:
         if what in (*_RECOVERED, "ended"):
             self.fault = what
-        self.tell(Event(self.clock(), self.name, what, f"{self.name} {text}"))
-
-
-def _shape(image: np.ndarray) -> str:
-    return f"{image.shape[1]}x{image.shape[0]}"
+        self.tell(Event(self.name, what, f"{self.name} {text}"))
 
 
 class CaptureThread(threading.Thread):
@@ -198,10 +193,8 @@ class CaptureThread(threading.Thread):
         while not self.stopping.is_set() and not self.stream.ended:
             self.stream.pump()
             self.wake()
-            wait = 0.0
-            if self.stream.fault == "unplugged":
-                wait = min(0.1, RETRY_EVERY)
-            elif not self.stream.origin.paced:
+            wait = 0.1 if self.stream.fault == "unplugged" else 0.0
+            if not self.stream.origin.paced:
                 due = max(due + 1 / self.stream.origin.fps, time.monotonic() - 0.1)
                 wait = due - time.monotonic()
             if wait > 0:

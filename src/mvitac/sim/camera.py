@@ -8,7 +8,6 @@ each grasp and independent of the outcome.
 Shapes: P rays (pixels times samples). Colours are linear RGB in [0, 1] until the last step. Units: metres, radians.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -25,67 +24,44 @@ VISIBLE = np.array([1, 1, 1, 0, 0, 0], np.uint8)
 """Geom groups that the camera sees; the collision bars of the fingers are not drawn."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class View:
     """The random properties of one picture that are independent of the outcome."""
 
-    position: np.ndarray  # camera position [3]
-    target: np.ndarray  # point [3] in the centre of the picture
-    roll: float
-    half_fov: float  # tangent of half the field of view
-    lamp: np.ndarray  # lamp position [3]
-    lamp_color: np.ndarray
-    ambient: float
-    exposure: float
-    table: str
-    table_colors: np.ndarray  # [2, 3]
-    table_turn: float
-    table_scale: float
-    wall_colors: np.ndarray  # [3, 3]: bottom, top, and a soft stain
-    wall_stain: np.ndarray  # direction [3] of the stain
-    gripper_color: np.ndarray
-    gel_color: np.ndarray
-    clutter_poses: np.ndarray  # [clutter, 7]: position and quaternion; absent objects are far below the table
-    clutter_colors: np.ndarray
-    noise: float
+    half_fov = 0.2  # tangent of half the field of view
 
-
-def draw_view(rng: np.random.Generator) -> View:
-    """Draw the view of one grasp."""
-    azimuth = np.deg2rad(-18 + rng.normal(0, 4))
-    elevation = np.deg2rad(33 + rng.normal(0, 3))
-    distance = 0.46 * rng.uniform(0.95, 1.08)
-    target = np.array([0.0, 0.0, 0.042]) + rng.normal(0, 0.004, 3)
-    forward = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
-    angle = azimuth + rng.uniform(-1.6, 1.6)
-    lamp = np.array([np.cos(angle), np.sin(angle), rng.uniform(0.7, 1.8)]) * rng.uniform(0.6, 1.0)
-    poses = _clutter(azimuth, rng)
-    tint = rng.normal(1, 0.10, 3)
-    return View(
-        position=target + distance * forward,
-        target=target,
-        roll=rng.normal(0, np.deg2rad(1.5)),
-        half_fov=0.2,
-        lamp=lamp,
-        lamp_color=tint * rng.uniform(0.7, 1.15),
-        ambient=rng.uniform(0.18, 0.45),
-        exposure=rng.uniform(0.75, 1.25),
-        table=str(rng.choice(TABLES)),
-        table_colors=_pair(rng),
-        table_turn=rng.uniform(0, np.pi),
-        table_scale=rng.uniform(0.02, 0.07),
-        wall_colors=rng.uniform(0.05, 0.85, (3, 3)),
-        wall_stain=rng.normal(size=3),
-        gripper_color=np.clip(rng.uniform(0.02, 0.08) * rng.normal(1, 0.12, 3), 0.01, 1),
-        gel_color=np.clip([0.25, 0.85, 1.0] * rng.normal(1, 0.1, 3), 0, 1),
-        clutter_poses=poses,
-        clutter_colors=rng.uniform(0.03, 0.9, (len(objects.CLUTTER), 3)),
-        noise=rng.uniform(1.0, 4.0),
-    )
+    def __init__(self, rng: np.random.Generator) -> None:
+        azimuth = np.deg2rad(-18 + rng.normal(0, 4))
+        elevation = np.deg2rad(33 + rng.normal(0, 3))
+        distance = 0.46 * rng.uniform(0.95, 1.08)
+        self.target = np.array([0.0, 0.0, 0.042]) + rng.normal(0, 0.004, 3)  # point in the centre of the picture
+        flat = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation)
+        self.position = self.target + distance * np.array([*flat, np.sin(elevation)])  # of the camera
+        angle = azimuth + rng.uniform(-1.6, 1.6)
+        lamp = np.array([np.cos(angle), np.sin(angle), rng.uniform(0.7, 1.8)])
+        self.lamp = lamp * rng.uniform(0.6, 1.0)  # its position
+        self.clutter_poses = _clutter(azimuth, rng)
+        tint = rng.normal(1, 0.10, 3)
+        self.roll = rng.normal(0, np.deg2rad(1.5))
+        self.lamp_color = tint * rng.uniform(0.7, 1.15)
+        self.ambient = rng.uniform(0.18, 0.45)
+        self.exposure = rng.uniform(0.75, 1.25)
+        self.table = str(rng.choice(TABLES))
+        self.table_colors = _pair(rng)
+        self.table_turn = rng.uniform(0, np.pi)
+        self.table_scale = rng.uniform(0.02, 0.07)
+        self.wall_colors = rng.uniform(0.05, 0.85, (3, 3))  # bottom, top, and a soft stain
+        self.wall_stain = rng.normal(size=3)  # its direction
+        self.gripper_color = np.clip(rng.uniform(0.02, 0.08) * rng.normal(1, 0.12, 3), 0.01, 1)
+        self.gel_color = np.clip([0.25, 0.85, 1.0] * rng.normal(1, 0.1, 3), 0, 1)
+        self.clutter_colors = rng.uniform(0.03, 0.9, (len(objects.CLUTTER), 3))
+        self.noise = rng.uniform(1.0, 4.0)
 
 
 def _clutter(azimuth: float, rng: np.random.Generator) -> np.ndarray:
-    """Draw poses [clutter, 7] behind the gripper or at its side, seen from ``azimuth``: nothing hides the object."""
+    """Draw poses [clutter, 7] behind the gripper or at its side, seen from ``azimuth``: nothing hides the object.
+
+    A pose is position and quaternion; absent objects are far below the table.
+    """
     poses = np.zeros((len(objects.CLUTTER), 7))
     for pose in poses:
         where = azimuth + np.pi + rng.uniform(-1.15, 1.15)

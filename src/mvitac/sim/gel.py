@@ -2,9 +2,10 @@
 
 Shapes: H, W pixels of a height map, row 0 at the top, x to the right, y down; heights and imprints in mm, forces in N.
 
-    press()       object relief [H, W] mm  ->  imprint [H, W] mm (displacement of the gel towards the camera)
-    contact()     object relief [H, W] mm  ->  depth, place and size of the contact
-    render()      imprint [H, W] mm        ->  picture [H, W, 3] uint8 of one `Sensor`
+    pressure()    object relief [H, W] mm      ->  pressure [H, W] N/mm^2
+    imprint()     pressure [H, W] N/mm^2       ->  imprint [H, W] mm (displacement of the gel towards the camera)
+    contact()     pressure [H, W] N/mm^2       ->  depth, place and size of the contact
+    render()      imprint [H, W] mm            ->  picture [H, W, 3] uint8 of one `Sensor`
 
 The gel is a Winkler foundation, independent springs (Johnson, Contact Mechanics, 1985, section 4.3), under a membrane.
 Colour is almost linear in slope and saturates: gels have matt paint and are lit at a grazing angle, with one colour of LED
@@ -21,9 +22,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, uniform_filter
 
 from mvitac.sim import measured
-from mvitac.sim.sensors import SENSORS, Pair, Sensor
-
-__all__ = ["GEL_STIFFNESS", "SENSORS", "Sensor", "area_resize", "contact", "press", "pressure", "relax", "render"]
+from mvitac.sim.sensors import Pair, Sensor
 
 F = NDArray[Any]  # float32 [H, W] unless said otherwise; numpy's stubs lose the width on the way
 GEL_STIFFNESS = 0.06  # Winkler modulus of the gel in N/mm^3: about 0.2 MPa over 3 to 4 mm
@@ -34,22 +33,23 @@ MEMBRANE_MM = (0.12, 0.35, 0.9)
 MEMBRANE_SAG = 0.8
 """Relative height of the bridge: the gel behind pushes the membrane into the gap, so shallow grooves remain visible."""
 
-KNOWN = ("depth_mm", "contact_x_mm", "contact_y_mm", "patch_mm2")
-"""What ``contact`` returns."""
-
 _TAG = 0x6E1
 
 
 def pressure(
     relief_mm: F, *, force_n: float, stiffness: float, pixel_mm: float, dome_radius_mm: float | None = 25.0
 ) -> F:
-    """Return the contact pressure [H, W] in N/mm^2 whose integral over the picture is `force_n`.
+    """Press an object into the gel: the contact pressure [H, W] in N/mm^2 whose integral over the picture is `force_n`.
 
-    Object and gel are springs in series at every pixel. The approach that balances the force is exact: with sorted gaps,
-    pressure is linear in the approach between two neighbouring gaps.
+    Object and gel are springs in series at every pixel, so the contact of a soft object is wider, shallower and flatter.
+    The approach that balances the force is exact: with sorted gaps, pressure is linear in it between two neighbouring gaps.
+
+    Args:
+        relief_mm: Object height [H, W]; higher = nearer to the gel, -inf = no object.
+        stiffness: Winkler modulus of the object in N/mm^3 (foam 0.01, wood above 10; 1e3 is rigid).
+        dome_radius_mm: Radius of the gel's dome; None = flat. Real gels are domed; a flat pad on a flat face gives a
+            nearly blank picture.
     """
-    if force_n == 0:
-        return np.zeros(relief_mm.shape, np.float32)
     height = np.array(relief_mm, np.float64)
     if dome_radius_mm is not None:  # a domed gel touches first at its centre
         x, y = _axes_mm(height.shape, pixel_mm)
@@ -65,19 +65,9 @@ def pressure(
     return (overlap * (spring / pixel_mm**2)).astype(np.float32)
 
 
-def press(relief_mm: F, *, force_n: float, stiffness: float, pixel_mm: float, dome_radius_mm: float | None = 25.0) -> F:
-    """Press an object into the gel: the imprint [H, W] in mm.
-
-    A soft object deforms, too, so its contact is wider, shallower and flatter at the same force.
-
-    Args:
-        relief_mm: Object height [H, W]; higher = nearer to the gel, -inf = no object.
-        stiffness: Winkler modulus of the object in N/mm^3 (foam 0.01, wood above 10; 1e3 is rigid).
-        dome_radius_mm: Radius of the gel's dome; None = flat. Real gels are domed; a flat pad on a flat face gives a
-            nearly blank picture.
-    """
-    spring = {"stiffness": stiffness, "pixel_mm": pixel_mm, "dome_radius_mm": dome_radius_mm}
-    return relax(pressure(relief_mm, force_n=force_n, **spring) / np.float32(GEL_STIFFNESS), pixel_mm=pixel_mm)
+def imprint(pressed: F, *, pixel_mm: float) -> F:
+    """Return the imprint [H, W] in mm of a pressure [H, W] in N/mm^2."""
+    return relax(pressed / np.float32(GEL_STIFFNESS), pixel_mm=pixel_mm)
 
 
 def relax(indent_mm: F, *, pixel_mm: float) -> F:
@@ -88,21 +78,17 @@ def relax(indent_mm: F, *, pixel_mm: float) -> F:
     return gaussian_filter(surface, 0.07 / pixel_mm, mode="nearest")  # the paint layer smooths the rest
 
 
-def contact(
-    relief_mm: F, *, force_n: float, stiffness: float, pixel_mm: float, dome_radius_mm: float
-) -> dict[str, float]:
-    """Measure the contact that ``gel.press`` renders with these arguments, before the membrane smooths it.
+def contact(pressed: F, *, pixel_mm: float) -> dict[str, float]:
+    """Measure the contact of a pressure [H, W] in N/mm^2, before the membrane smooths it.
 
     Returns "depth_mm", the deepest indentation of the gel; "contact_x_mm" and "contact_y_mm", the centre of pressure,
     right and down from the middle of the picture (NaN without contact); "patch_mm2", the area under pressure.
     """
-    spring = {"stiffness": stiffness, "pixel_mm": pixel_mm, "dome_radius_mm": dome_radius_mm}
-    p = pressure(relief_mm, force_n=force_n, **spring).astype(np.float64)
-    if not (total := float(p.sum())):
-        return dict(zip(KNOWN, (0.0, math.nan, math.nan, 0.0), strict=True))
+    p = pressed.astype(np.float64)
     x, y = ((np.arange(n) - (n - 1) / 2) * pixel_mm for n in (p.shape[1], p.shape[0]))
-    centre = float(p.sum(0) @ x) / total, float(p.sum(1) @ y) / total
-    return dict(zip(KNOWN, (float(p.max()) / GEL_STIFFNESS, *centre, float((p > 0).sum()) * pixel_mm**2), strict=True))
+    total = float(p.sum()) or math.nan
+    centre = {"contact_x_mm": float(p.sum(0) @ x) / total, "contact_y_mm": float(p.sum(1) @ y) / total}
+    return {"depth_mm": float(p.max()) / GEL_STIFFNESS, **centre, "patch_mm2": float((p > 0).sum()) * pixel_mm**2}
 
 
 def render(

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from mvitac.sim import camera, gel, objects, physics, skin
+from mvitac.sim.sensors import SENSORS
 
 VERSION = 2
 NUM_OBJECTS = 106
@@ -65,7 +66,7 @@ def grasp(
 
     Args:
         held_out_sensor: Use the sensor that is not used otherwise.
-        measured: Also return what physics knows of the contact of each gel: ``gel.KNOWN`` and the shear force in N,
+        measured: Also return what physics knows of the contact of each gel: ``gel.contact`` and the shear force in N,
             right and down in the gel's picture, with names such as ``depth_left_mm`` and ``shear_x_right_n``.
 
     Returns:
@@ -76,15 +77,13 @@ def grasp(
         (``lift_mm``, ``unstable``) and the contact (``normal_*_n``, and ``contact_*``, the mean imprint of that gel in
         mm, a control).
     """
-    if not 16 <= size <= 1024:
-        raise ValueError(f"size must be in 16..1024 pixels, got {size}")
     bench, key = _bench(seed, obj), (seed, obj, index)
     thing, rng = bench.thing, np.random.default_rng([_PLAN, *key])
     patch = skin.draw_patch(rng)
     plan = draw_plan(thing, patch, rng)
-    view = camera.draw_view(np.random.default_rng([_VIEW, *key]))
+    view = camera.View(np.random.default_rng([_VIEW, *key]))
     feel = np.random.default_rng([_TOUCH, *key])
-    sensors = [sensor for sensor in gel.SENSORS.values() if sensor.held_out == held_out_sensor]
+    sensors = [sensor for sensor in SENSORS.values() if sensor.held_out == held_out_sensor]
     sensor = sensors[int(feel.random() * len(sensors))]
     units, gain = feel.integers(2**31, size=2).tolist(), feel.uniform(0.75, 1.3)
     known = {"object": thing.name, "sensor": sensor.name, **_latents(thing, patch, plan)}
@@ -142,17 +141,16 @@ def _pressed(
     If ``measured``, also return what physics knows of the contact: depth_mm, shear_x_n, ...
     """
     touch = (moment.left, moment.right)[side]
-    relief = _relief(bench, patch, side, grid) if touch.normal_n > 0 else None
-    spring = {"stiffness": bench.thing.stiffness, "pixel_mm": FIELD_MM / grid, "dome_radius_mm": objects.DOME_RADIUS_MM}
-    imprint, force = np.zeros((grid, grid), np.float32), 0.0
-    if relief is not None:
-        force = touch.normal_n
-        # Thickness of the gel; only corners at the rim come near it.
-        imprint = np.minimum(gel.press(relief, force_n=force, **spring), np.float32(2.5))
+    pixel, pressed = FIELD_MM / grid, np.zeros((grid, grid), np.float32)
+    if touch.normal_n > 0 and (relief := _relief(bench, patch, side, grid)) is not None:
+        spring = {"stiffness": bench.thing.stiffness, "pixel_mm": pixel, "dome_radius_mm": objects.DOME_RADIUS_MM}
+        pressed = gel.pressure(relief, force_n=touch.normal_n, **spring)
+    # Thickness of the gel; only corners at the rim come near it.
+    imprint = np.minimum(gel.imprint(pressed, pixel_mm=pixel), np.float32(2.5))
     if not measured:
         return imprint, {}
-    found = gel.contact(imprint if relief is None else relief, force_n=force, **spring)
-    return imprint, {**found, "shear_x_n": touch.shear_n[0], "shear_y_n": touch.shear_n[1]}
+    shear = dict(zip(("shear_x_n", "shear_y_n"), touch.shear_n, strict=True))
+    return imprint, {**gel.contact(pressed, pixel_mm=pixel), **shear}
 
 
 def _relief(bench: physics.Bench, patch: skin.Patch, side: int, grid: int) -> np.ndarray | None:

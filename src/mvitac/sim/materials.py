@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mvitac.sim import gel
 from mvitac.sim.coordinates import Place, grid, outline, turn
-from mvitac.sim.gel import GEL_STIFFNESS, F, area_resize, contact, press, render
+from mvitac.sim.gel import GEL_STIFFNESS, F, area_resize
 from mvitac.sim.relief import Relief, draw_tables, fractal, marks
 from mvitac.sim.sensors import SENSORS, Sensor
 
@@ -30,7 +31,6 @@ SOFT_BELOW = 0.12  # stiffness in N/mm^3 below which an instance is labelled sof
 _TAG = 0x3A7
 _TOUCH_MM = 12.8  # width of the gel's field of view
 _CAMERA_MM = 90.0  # width of the camera's field of view at zoom 1
-MIN_SIZE, MAX_SIZE = 16, 512
 
 
 @dataclass(frozen=True)
@@ -76,18 +76,31 @@ MATERIALS: tuple[Material, ...] = (
 CLASSES: tuple[str, ...] = tuple(m.name for m in MATERIALS)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Instance:
     """One object: what both its pictures share. Lengths in mm, stiffness in N/mm^3."""
 
-    sight: Relief
-    feel: Relief
-    stiffness: float
-    amplitude_mm: float
-    gloss: float
-    colour: NDArray[np.float32]
-    ink: NDArray[np.float32]  # second colour, which follows the relief with either sign
-    contrast: float
+    def __init__(self, seed: int, category: int, instance: int) -> None:
+        """Draw the object, which depends on the three numbers only."""
+        rng = np.random.default_rng([_TAG, seed, category, instance])
+        m = MATERIALS[category]
+        soft, rough = rng.random() < m.soft, rng.random() < m.rough
+        decades = rng.uniform(0.1, 0.6) if soft else -rng.uniform(0.1, 1.6)
+        asperity = rng.uniform(0.3, 0.85) * (1 if rough else -1)
+        wavelength = np.exp(rng.uniform(*np.log(m.wavelength_mm)))
+        shared: Any = {"anisotropy": rng.uniform(*m.anisotropy), "irregularity": rng.uniform(*m.irregularity)}
+        ratio = rng.uniform(6.0, 9.0)
+        shared |= {"asperity": asperity, "tables": draw_tables(rng)}
+        self.sight = Relief(kind=m.sight, wavelength_mm=wavelength * ratio, **shared)
+        self.feel = Relief(kind=m.feel, wavelength_mm=wavelength, **shared)
+        self.stiffness: float = SOFT_BELOW * 10**-decades
+        mean = np.asarray(m.colour, np.float32)
+        colour = np.clip(mean * np.exp(rng.normal(0, 0.28)) * np.exp(rng.normal(0, 0.12, 3)), 0.08, 0.85)
+        self.colour = colour.astype(np.float32)
+        self.amplitude_mm = float(np.exp(rng.uniform(*np.log((0.05, 0.13)))))
+        self.gloss = rng.uniform(*m.gloss)
+        # The second colour follows the relief with either sign.
+        self.ink = np.clip(colour * np.exp(rng.normal(0, 0.25, 3)), 0.05, 0.9).astype(np.float32)
+        self.contrast = rng.uniform(-0.6, 0.6)
 
     @property
     def soft(self) -> bool:
@@ -101,32 +114,6 @@ class Instance:
     def curl(self) -> float:
         """Whether marks and outlines are folds (1) or cracks (0), continuously."""
         return float(np.clip(0.5 - 2.6 * np.log10(self.stiffness / SOFT_BELOW), 0.0, 1.0))
-
-
-def draw_instance(seed: int, category: int, instance: int) -> Instance:
-    """Draw the latents of one object, which depend only on the three numbers."""
-    rng = np.random.default_rng([_TAG, seed, category, instance])
-    m = MATERIALS[category]
-    soft, rough = rng.random() < m.soft, rng.random() < m.rough
-    decades = rng.uniform(0.1, 0.6) if soft else -rng.uniform(0.1, 1.6)
-    asperity = rng.uniform(0.3, 0.85) * (1 if rough else -1)
-    wavelength = np.exp(rng.uniform(*np.log(m.wavelength_mm)))
-    shared = {"anisotropy": rng.uniform(*m.anisotropy), "irregularity": rng.uniform(*m.irregularity)}
-    shared["asperity"] = asperity
-    ratio = rng.uniform(6.0, 9.0)
-    tables = draw_tables(rng)
-    mean = np.asarray(m.colour, np.float32)
-    colour = np.clip(mean * np.exp(rng.normal(0, 0.28)) * np.exp(rng.normal(0, 0.12, 3)), 0.08, 0.85)
-    return Instance(
-        sight=Relief(kind=m.sight, wavelength_mm=wavelength * ratio, tables=tables, **shared),
-        feel=Relief(kind=m.feel, wavelength_mm=wavelength, tables=tables, **shared),
-        stiffness=SOFT_BELOW * 10**-decades,
-        amplitude_mm=float(np.exp(rng.uniform(*np.log((0.05, 0.13))))),
-        gloss=rng.uniform(*m.gloss),
-        colour=colour.astype(np.float32),
-        ink=np.clip(colour * np.exp(rng.normal(0, 0.25, 3)), 0.05, 0.9).astype(np.float32),
-        contrast=rng.uniform(-0.6, 0.6),
-    )
 
 
 def touch(
@@ -145,7 +132,7 @@ def touch(
 
     Args:
         background: Also return "background", the same copy of the sensor before contact.
-        measured: Also return depth, position and size of the contact (`gel.KNOWN`).
+        measured: Also return depth, position and size of the contact (`gel.contact`).
         sensors: Sensors to choose from; all else is the same. Default: all that are not held out.
         through: 0, or the number of a further sensor that is pressed on the same spot with the same force. It differs
             from those of smaller numbers; the camera takes another picture.
@@ -153,11 +140,7 @@ def touch(
     Returns:
         "vision" and "touch" (uint8 [size, size, 3]), "category", "soft", "rough" and the latents.
     """
-    if not 0 <= category < len(CLASSES):
-        raise ValueError(f"category must be 0 to {len(CLASSES) - 1}, got {category}")
-    if not MIN_SIZE <= size <= MAX_SIZE:
-        raise ValueError(f"size must be {MIN_SIZE} to {MAX_SIZE} pixels, got {size}")
-    thing = draw_instance(seed, category, instance)
+    thing = Instance(seed, category, instance)
     # One random stream per picture, so that they are independent; pixel noise is drawn last in each.
     pose, eye, finger = np.random.default_rng([_TAG, seed, category, instance, touch]).spawn(3)
     angle, place = pose.uniform(0, 2 * np.pi), pose.uniform(-400, 400, 2)
@@ -292,14 +275,15 @@ def _feel(
     # Soft objects bulge, otherwise the width of the contact would reveal them.
     bulge = np.float32(yielding * rng.uniform(0.6, 1.2) / (2 * dome))
     relief = relief + tilt[0] * x + tilt[1] * y - bulge * (x * x + y * y)
-    physics: dict[str, Any] = {"stiffness": thing.stiffness, "pixel_mm": pixel, "dome_radius_mm": dome}
-    imprint = press(relief, force_n=force, **physics)
+    physics: Any = {"force_n": force, "stiffness": thing.stiffness, "pixel_mm": pixel, "dome_radius_mm": dome}
+    pressed = gel.pressure(relief, **physics)
     if again is not None:
         rng, gain = again, float(np.exp(again.uniform(*np.log((0.5, 1.2)))))
     unit = int(rng.integers(2**31))
-    draw = partial(render, sensor=sensor, rng=rng, pixel_mm=pixel, size=size, unit=unit, gain=gain)
+    draw = partial(gel.render, sensor=sensor, rng=rng, pixel_mm=pixel, size=size, unit=unit, gain=gain)
+    imprint = gel.imprint(pressed, pixel_mm=pixel)
     made: dict[str, Any] = {"touch": draw(imprint, shear_mm=(float(shear[0]), float(shear[1])))}
     if background:  # rendered last, so that other pictures do not change
         made["background"] = draw(np.zeros_like(imprint))
     made |= {"sensor": sensor.name, "force_n": force}
-    return made | (contact(relief, force_n=force, **physics) if measured else {})
+    return made | (gel.contact(pressed, pixel_mm=pixel) if measured else {})

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mvitac.sim.skin import Finish, draw_finish
+from mvitac.sim.skin import Finish
 
 OBJECT_TAG = 0x0B1EC7
 """First word of the seed sequence of object properties. Grasps use other tags, because trailing zeros are ignored."""
@@ -199,7 +199,7 @@ def make_thing(seed: int, index: int) -> Thing:
     return Thing(
         name=f"{kind}_{index:03d}",
         parts=parts,
-        finish=draw_finish(rng),
+        finish=Finish(rng),
         density=rng.uniform(*MASS_KG) / sum(part.volume() * part.density for part in parts),
         softness=float(rng.choice([0.0, 0.0, rng.uniform(0.3, 1.0)])),
     )

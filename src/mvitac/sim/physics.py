@@ -6,7 +6,7 @@ Frames and units as in :mod:`mvitac.sim.objects`: metres, kilograms, newtons, ra
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -53,9 +53,9 @@ class Moment:
     phase: str
     left: Touch
     right: Touch
-    success: int  # valid at 'after'
-    rise_m: float
     unstable: int
+    success: int = 0  # valid at 'after', as is the rise
+    rise_m: float = 0.0
 
 
 def contact_radius_m(part: objects.Part, force_n: float, stiffness: float) -> float:
@@ -85,21 +85,21 @@ class Bench:
         data = self.data
         height, start = self._place(plan)
         unstable = self._run(SETTLE_S, lambda _: height, lambda _: start)
-        yield self._moment("before", 0.0, unstable)
+        yield Moment(phase="before", left=self._touch(0), right=self._touch(1), unstable=unstable)
 
         # The set point continues into the object: the force limit determines where the fingers stop.
         unstable |= self._run(CLOSE_S, lambda _: height, lambda t: min(start + CLOSE_SPEED * t, objects.OPEN_M))
-        yield self._moment("during", 0.0, unstable)
+        yield Moment(phase="during", left=self._touch(0), right=self._touch(1), unstable=unstable)
 
         lowest = float(data.xipos[self.body, 2])
         closed = min(start + CLOSE_SPEED * CLOSE_S, objects.OPEN_M)
         unstable |= self._run(LIFT_S + HOLD_S, lambda t: height + _lifted(plan.lift_m, t), lambda _: closed)
         rise = float(data.xipos[self.body, 2]) - lowest
-        moment = self._moment("after", rise, unstable)
-        held = moment.left.normal_n > 0 and moment.right.normal_n > 0
+        left, right = self._touch(0), self._touch(1)
         on_table = any(0 in pair for pair in data.contact.geom[: data.ncon])
-        success = int(held and rise > HELD_PART * plan.lift_m and not on_table and not unstable)
-        yield replace(moment, success=success)
+        held = left.normal_n > 0 and right.normal_n > 0 and rise > HELD_PART * plan.lift_m and not on_table
+        success = int(held and not unstable)
+        yield Moment(phase="after", left=left, right=right, unstable=unstable, success=success, rise_m=rise)
 
     def _place(self, plan: Plan) -> tuple[float, float]:
         """Reset the scene for ``plan``; return the height of the hand and the position of the open fingers."""
@@ -140,10 +140,6 @@ class Bench:
                 mujoco.mj_forward(model, data)
                 return 1
         return 0
-
-    def _moment(self, phase: str, rise: float, unstable: int) -> Moment:
-        left, right = self._touch(0), self._touch(1)
-        return Moment(phase=phase, left=left, right=right, success=0, rise_m=rise, unstable=unstable)
 
     def _touch(self, side: int) -> Touch:
         """Return the sum of contact forces on a pad's dome."""
