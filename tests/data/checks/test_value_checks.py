@@ -28,8 +28,7 @@ class Recordings(Source):
     fault: str = ""
 
     def spec(self) -> DataSpec:
-        unit = "mN" if self.fault == "unit" else "N"
-        force = ValueTask(name="force", targets=(Target(name="force_n", unit=unit),))
+        force = ValueTask(name="force", targets=(Target(name="force_n", unit="N"),))
         tilt = ValueTask(name="pose", targets=(Target(name="tilt", unit="rad"),))
         return DataSpec(
             name="recordings",
@@ -55,12 +54,8 @@ class Recordings(Source):
         tilt = 0.3 * np.sin(k + i / 5)
         if fault == "group of another unit" and k == 5:
             force *= 1000
-        if fault == "degrees":
-            tilt = np.rad2deg(tilt) * 5
         if fault == "outlier" and item == 100:
             force = 60.0
-        if fault == "negative" and k == 1 and 10 <= i < 16:
-            force = -0.12 * min(i - 9, 16 - i)
         if fault == "stuck" and k == 4 and 10 <= i < 24:
             force = 2.0
         if fault == "outside" and k == 7:
@@ -95,16 +90,8 @@ def test_healthy_values_and_windows(healthy: Pack) -> None:
 @pytest.mark.parametrize(
     ("fault", "item", "says", "rows"),
     [
-        ("unit", "values of force", "the name force_n says N, the unit is mN", []),
         ("group of another unit", "values of force", "values of 5 are about", []),
-        ("degrees", "values of pose", "more likely degrees than rad", []),
         ("outlier", "values of force", "1 outliers, e.g. 60 in row 100", [100]),
-        (
-            "negative",
-            "values of force",
-            "6 rows are below -0.12, down to -0.36, although 99 % are above; the first is row 50",
-            [50],
-        ),
         ("stuck", "values of force", "1 constant stretches, the longest 14 frames of 2 from row 170", [170]),
         ("outside", "values of force", "test rows are outside train (0.1", []),
     ],

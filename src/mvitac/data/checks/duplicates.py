@@ -16,23 +16,19 @@ MAX_ASKED, MAX_SEARCHED = 2000, 40_000
 
 
 def exact_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
-    """Find identical images in different splits. Copies within a split are counted only."""
+    """Find identical images in different splits."""
     sides = sides_of(pack.column("split").astype(str))
-    notes, rows, inside = [], [], []
+    notes, rows = [], []
     for name, one in looks.items():
-        _, first, numbers, counts = np.unique(one.exact, return_index=True, return_inverse=True, return_counts=True)
-        if repeated := int(((counts[numbers] > 1) & one.seen).sum()):
-            inside.append(f"{name}: {share(repeated, pack.num)} rows share their pixels with another")
+        _, first, numbers = np.unique(one.exact, return_index=True, return_inverse=True)
         different = sides != sides[first[numbers]]
         across = np.flatnonzero(np.isin(numbers, numbers[different]) & one.seen)
         if len(across):
-            across = across[np.argsort(numbers[across], kind="stable")]
             notes.append(f"{name}: {share(len(across), pack.num)} rows have a copy in another split")
-            rows += across.tolist()
-    item = "identical images across splits"
-    evidence = "; ".join(notes) or "none" + (f" (inside one split: {'; '.join(inside)})" if inside else "")
+            rows += across[np.argsort(numbers[across], kind="stable")].tolist()
     advice = "remove the copies, or put them in one group so that they stay in one split"
-    return judged(item, evidence, advice, rows, look=False, broken=bool(notes))
+    found = "; ".join(notes) or "none"
+    return judged("identical images across splits", found, advice, rows, look=False, broken=bool(notes))
 
 
 def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:

@@ -77,15 +77,7 @@ def _mirrored(thumbs: np.ndarray) -> tuple[np.ndarray, bool, str]:
 
 
 def _where(pack: Pack, rows: np.ndarray) -> str:
-    """Return the sensors or groups that ``rows`` consist of, if any."""
-    for column in ("sensor", "group"):
-        if column in pack.table.column_names:
-            values = pack.column(column).astype(str)
-            names, counts = np.unique(values[rows], return_counts=True)
-            whole = [n for n, count in zip(names, counts, strict=True) if count >= 0.8 * (values == n).sum()]
-            if whole and sum((values[rows] == n).sum() for n in whole) >= 0.8 * len(rows):
-                return f", whole {column}s: {listed(whole, 3)}"
-    return ""
+    return f", of {pack.spec.group_by} {listed(np.unique(pack.column('group')[rows].astype(str)).tolist(), 3)}"
 
 
 def swapped_modalities(pack: Pack, looks: dict[str, ImageStats]) -> Finding:

@@ -3,13 +3,11 @@
 import re
 import unicodedata
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from mvitac.data.checks.finding import Finding, judged, share
 from mvitac.data.pack import Pack
-from mvitac.data.pack_table import SPLITS
 from mvitac.data.spec import UNGROUPED, listed
 
 KEYS = ("object", "instance", "recording", "video", "grasp", "experiment", "session", "sequence")
@@ -68,17 +66,14 @@ def class_balance(pack: Pack) -> list[Finding]:
             findings.append(Finding(item, "not checkable", "no labels in train or test"))
             continue
         majority, names = test[train.argmax()] / test.sum(), np.array(task.classes)
-        unseen, unasked = names[(test > 0) & (train == 0)].tolist(), names[test == 0].tolist()
         always = task.classes[train.argmax()]
+        unseen, unasked = names[(test > 0) & (train == 0)].tolist(), names[test == 0].tolist()
         evidence = f"{len(names)} classes; always saying {always!r} scores {100 * majority:.1f} % on test"
         evidence += f"; never tested: {listed(unasked, 3)}" if unasked else ""
         evidence += f"; tested but never seen in training: {listed(unseen, 3)}" if unseen else ""
         skewed = majority > 0.9 or (majority > 0.75 and len(names) > 2)
-        advice = (
-            "assign the groups to splits again, or drop the classes"
-            if unseen or unasked
-            else "report balanced accuracy"
-        )
+        again = "assign the groups to splits again, or drop the classes"
+        advice = again if unseen or unasked else "report balanced accuracy"
         findings.append(judged(item, evidence, advice, look=bool(unasked) or skewed, broken=bool(unseen)))
     return findings
 
@@ -88,27 +83,17 @@ def sides_of(splits: np.ndarray) -> np.ndarray:
     return np.where(splits == "unlabelled", "train", splits)
 
 
-def split_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield (name, rows that count, their splits) of ``split`` and of each other column of split names (folds).
+def leaks(pack: Pack) -> list[Finding]:
+    """Find groups, touch groups and other keys in more than one split, for the split of each task.
 
     In a task's own column, rows without its label do not count: they are used neither to train nor to test.
     """
-    for name in pack.table.column_names:
-        values = pack.column(name)
-        if values.dtype == object and set(np.unique(values.astype(str))) <= set(SPLITS):
-            own = [pack.column(f"label_{task.name}") >= 0 for task in pack.spec.tasks if task.split == name != "split"]
-            rows = np.flatnonzero(np.logical_or.reduce(own)) if own else np.arange(pack.num)
-            sides = sides_of(values.astype(str)[rows])
-            if name == "split" or len(np.unique(sides)) > 1:
-                yield name, rows, sides
-
-
-def leaks(pack: Pack) -> list[Finding]:
-    """Find groups, touch groups and other keys in more than one split, per split column. Correct folds are one finding."""
-    findings, sound = [], []
+    findings = []
     names = [n for n in ("group", "touch_group", *KEYS) if n in pack.table.column_names]
-    none = f"none of {', '.join(names)} is in more than one split"
-    for split, counted, sides in split_columns(pack):
+    for split in pack.spec.split_columns:
+        own = [pack.answered(task) for task in pack.spec.all_tasks if task.split == split != "split"]
+        counted = np.flatnonzero(np.logical_or.reduce(own)) if own else np.arange(pack.num)
+        sides = sides_of(pack.column(split).astype(str)[counted])
         notes: dict[str, str] = {}
         rows = []
         for name in names:
@@ -124,15 +109,11 @@ def leaks(pack: Pack) -> list[Finding]:
                 for one in both[:4]:  # a row of each split, side by side on the sheet
                     mine = np.flatnonzero(values == one)
                     rows += [int(counted[mine[sides[mine] == side][0]]) for side in np.unique(sides[mine])]
-        if split != "split" and not notes:
-            sound.append(split)
-            continue
         item = "groups across splits" if split == "split" else f"groups across column {split}"
+        evidence = "; ".join(notes.values()) or f"none of {', '.join(names)} is in more than one split"
         advice = "split by the largest of these keys, or report what test shares with train"
         broken = not notes.keys().isdisjoint(("group", "touch_group"))
-        findings.append(judged(item, "; ".join(notes.values()) or none, advice, rows, look=bool(notes), broken=broken))
-    if sound:
-        findings.append(Finding("groups across split columns", "ok", f"{listed(sound, 8)}: {none}"))
+        findings.append(judged(item, evidence, advice, rows, look=bool(notes), broken=broken))
     return findings
 
 
@@ -217,50 +198,25 @@ def _numbers(cells: np.ndarray) -> np.ndarray | None:
         return None
 
 
-MAX_SHOWN = 20
-
-
 def similar_names(pack: Pack) -> Finding:
     """Find groups and classes whose names differ only in Unicode form, case, blanks or leading zeros."""
-    notes: list[str] = []
-    rows: list[int] = []
-    sides = sides_of(pack.column("split").astype(str))
-    for column in ("group", "touch_group", *KEYS):
-        if column not in pack.table.column_names:
-            continue
-        values = pack.column(column).astype(str)
-        alike = _alike(np.unique(values).tolist())
-        on = [{side for name in names for side in sides[values == name].tolist()} for names in alike]
-        apart = sum(len(found) > 1 for found in on)
-        if alike:
-            leak = f"; {apart} of these are in more than one split" if apart else ""
-            notes.append(f"{column}: {_shown(alike)}{leak}")
-            rows += [int(np.flatnonzero(values == name)[0]) for names in alike[:4] for name in names]
-    for task in pack.spec.tasks:
-        if alike := _alike(task.classes):
-            notes.append(f"classes of {task.name}: {_shown(alike)}")
-    evidence = "; ".join(dict.fromkeys(notes)) or "no two groups or classes differ only in case, blanks or zeros"
+    columns = [name for name in ("group", "touch_group", *KEYS) if name in pack.table.column_names]
+    names = {name: np.unique(pack.column(name).astype(str)).tolist() for name in columns}
+    names |= {f"classes of {task.name}": list(task.classes) for task in pack.spec.tasks}
+    notes = []
+    for where, given in names.items():
+        alike: dict[str, list[str]] = defaultdict(list)
+        for name in given:
+            alike[_key(name)].append(ascii(name))  # shows what looks the same: Unicode forms, non-breaking blanks
+        if pairs := [" and ".join(several) for several in alike.values() if len(several) > 1]:
+            notes.append(f"{where}: {listed(pairs)}")
+    evidence = "; ".join(notes) or "no two groups or classes differ only in case, blanks or zeros"
     advice = "if they mean the same, write them alike and pack again"
-    return judged("names that differ in spelling only", evidence, advice, list(dict.fromkeys(rows)), look=bool(notes))
-
-
-def _alike(names: Sequence[str]) -> list[list[str]]:
-    """Return the sets of names with the same ``_key``."""
-    found: dict[str, list[str]] = defaultdict(list)
-    for name in names:
-        found[_key(name)].append(name)
-    return [several for several in found.values() if len(several) > 1]
+    return judged("names that differ in spelling only", evidence, advice, look=bool(notes))
 
 
 def _key(name: str) -> str:
-    """Return ``name`` without case, Unicode variants, invisible characters, leading zeros, and blanks next to letters."""
+    """Return ``name`` without case, Unicode variants, blanks next to letters, and leading zeros."""
     text = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold())
-    text = "".join(c for c in text if unicodedata.category(c) != "Cf")
     text = re.sub(r"(?<!\d)[\s_]+|[\s_]+(?!\d)", "", text)
     return re.sub(r"(?<![\d.])0+(?=\d)", "", text)
-
-
-def _shown(alike: list[list[str]]) -> str:
-    # ascii() shows what looks the same on the screen: Unicode forms, non-breaking blanks.
-    quoted = [" and ".join(repr(n) if n.isprintable() and n.isascii() else ascii(n) for n in names) for names in alike]
-    return listed(quoted, MAX_SHOWN)

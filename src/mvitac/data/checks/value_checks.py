@@ -1,7 +1,5 @@
 """Checks of tasks with values (units, outliers, stuck sensors, test outside train), and of windows of frames."""
 
-import re
-
 import numpy as np
 
 from mvitac.data.checks.finding import Finding, judged, share
@@ -11,8 +9,6 @@ from mvitac.data.spec import Target, ValueTask, Window, listed
 from mvitac.data.stamps import STAMPS, seconds
 from mvitac.data.windows import frames_of, places, recordings
 
-UNITS = ("N", "mN", "kN", "m", "cm", "mm", "um", "deg", "rad", "s", "ms", "kg", "g", "Nm", "Pa", "kPa")
-"""Units whose name at the end of a column's name, as in depth_mm, is taken for the unit of the column."""
 STUCK_FRAMES = 10  # shortest constant stretch that is reported
 BLOCK = 240  # rows of a long recording in which one shift is looked for, up to a third of them
 CLEAR, GAIN, SHIFTED = 0.7, 0.05, 1 / 3
@@ -44,7 +40,7 @@ def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, tou
     if missing := sum(map(len, sides.values())) - len(rows):
         evidence.append(f"{share(missing, missing + len(rows))} rows of train, val and test have none")
     checks = {
-        "check the unit": _unit(target, known, pack.column("group")[rows].astype(str)),
+        "check the unit": _unit(known, pack.column("group")[rows].astype(str)),
         "repair these cells, or leave them empty": _outliers(rows, known),
         "a stuck or saturated sensor: leave these cells empty": _stuck(found, touches),
         "expect larger errors there, or split so that train covers test": _outside(found, measured, target),
@@ -67,39 +63,27 @@ def _touches(pack: Pack) -> list[np.ndarray]:
         return []
 
 
-def _unit(target: Target, known: np.ndarray, groups: np.ndarray) -> Note:
-    """The column's name says another unit, angles in rad are too large, or one group has another scale."""
-    notes = []
-    ending = re.search(r"_([A-Za-z]+)$", target.name)
-    named = next((unit for unit in UNITS if ending and unit.lower() == ending[1].lower()), None)
-    if named and target.unit in UNITS and target.unit.lower() != named.lower():
-        notes.append(f"the name {target.name} says {named}, the unit is {target.unit}")
-    if target.unit == "rad" and np.percentile(abs(known), 95) > 8 * np.pi:
-        notes.append(f"angles to {abs(known).max():.4g} are more likely degrees than rad")
+def _unit(known: np.ndarray, groups: np.ndarray) -> Note:
+    """One group has another scale."""
     names, counts = np.unique(groups, return_counts=True)
     names = names[counts >= 20]
     sizes = np.array([np.median(abs(known[groups == name])) for name in names])
     usual = np.median(sizes) if len(sizes) else 0
     odd = (sizes > 300 * usual) | ((sizes > 0) & (sizes < usual / 300))
-    if len(names) >= 4 and usual > 0 and odd.any():
-        times = sizes[odd][0] / usual
-        notes.append(f"values of {listed(names[odd].tolist(), 3)} are about {times:.2g} times those of other groups")
-    return "; ".join(notes), []
+    if len(names) < 4 or not usual or not odd.any():
+        return "", []
+    times = sizes[odd][0] / usual
+    return f"values of {listed(names[odd].tolist(), 3)} are about {times:.2g} times those of other groups", []
 
 
 def _outliers(rows: np.ndarray, known: np.ndarray) -> Note:
-    """Values far outside the usual range, and rare negative ones of a quantity that is positive otherwise."""
+    """Values far outside the usual range."""
     low, high = np.percentile(known, [1, 99])
     far = np.maximum(known - high, low - known) > 1.5 * (high - low)
-    negative = (known < -0.04 * high) & (low >= -0.04 * high)
-    notes = []
-    if high > low and far.any():
-        usual = f"(most are {low:.4g} to {high:.4g})"
-        notes.append(f"{int(far.sum())} outliers, e.g. {known[far][0]:.4g} in row {rows[far][0]} {usual}")
-    if high > 0 and negative.any():
-        text = f"{int(negative.sum())} rows are below {-0.04 * high:.3g}, down to {known.min():.4g}, although 99 % are above"
-        notes.append(f"{text}; the first is row {rows[negative][0]}")
-    return "; ".join(notes), rows[(far & (high > low)) | (negative & (high > 0))].tolist()
+    if high <= low or not far.any():
+        return "", []
+    usual = f"(most are {low:.4g} to {high:.4g})"
+    return f"{int(far.sum())} outliers, e.g. {known[far][0]:.4g} in row {rows[far][0]} {usual}", rows[far].tolist()
 
 
 def _stuck(found: np.ndarray, touches: list[np.ndarray]) -> Note:
