@@ -242,7 +242,7 @@ def compare_methods(session: Session, data: list[str]) -> None:
             tar.extractall(folder)
     write_json(session.work / "plan.json", plan(session.size))
     given = ["mvitac", "compare", "--plan", str(session.work / "plan.json"), *data, "--out", str(folder)]
-    given += ["--jobs", "1", "--device", session.device]
+    given += ["--device", session.device]
     done = len(session.found["runs"]) // session.size.rows
     for seed in range(min(done, session.size.seeds - 1), session.size.seeds):
         if session.left() < TABLE_SECONDS:

@@ -2,7 +2,7 @@
 # Run all methods of Tables I and II on every dataset (CPU), after writing the manifests. docs/results/real.md has the
 # options of its tables.
 # Arguments: data folder, output folder, options of mvitac compare. A stopped script continues where it was stopped.
-#   examples/real.sh ../shared/data runs/real --jobs 2
+#   examples/real.sh ../shared/data runs/real
 #   STEPS=150 SETS="vt60 physiclear-by-group" examples/real.sh ...    # shorter runs, only these datasets
 set -euo pipefail
 data=$1 out=$2

@@ -82,15 +82,6 @@ def ctrl_c() -> Iterator[None]:
 
 
 @pytest.fixture
-def forked_pools(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Processes of a comparison begin at once (``support.processes``); new ones would import torch, 5 s of CPU each."""
-    from mvitac.experiments import jobs
-    from support.processes import CONTEXT
-
-    monkeypatch.setattr(jobs, "SPAWN", CONTEXT)
-
-
-@pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports with empty figures, for tests of their text: one has up to thirty, each of which takes 0.2 s to draw."""
     from mvitac.report import figures, galleries

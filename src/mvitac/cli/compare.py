@@ -4,8 +4,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from mvitac.cli.options import parse, selectors
 from mvitac.datasets.base import DatasetConfig, dataset
 from mvitac.evaluation.evaluate import ProbeConfig
@@ -19,6 +17,7 @@ from mvitac.recipes import RECIPES
 from mvitac.registry import to_json, unknown
 from mvitac.system.device import pick_device
 from mvitac.system.files import check_place, write_json
+from mvitac.system.locks import hold_lock
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,11 +39,9 @@ class _Options:
     set: tuple[str, ...] = ()
     """field=value for every row of the plan, e.g. --set steps=100 encoder.weights=scratch; a row's own values come
     after."""
-    jobs: int | None = None
-    """Runs at a time; none = one per GPU, one on a machine without. The same command given again meanwhile, also on
-    another machine that shares the folder, takes the runs that no process has."""
     device: str = "auto"
-    """auto, cpu, cuda or cuda:N; with several jobs and GPUs each job has its own."""
+    """auto, cpu, cuda or cuda:N. The same command given again meanwhile, on another GPU or on a machine that shares the
+    folder, takes the runs that no process has."""
     dry_run: bool = False
     """Print the plan, what is finished and what is left, and stop."""
     tables_only: bool = False
@@ -76,7 +73,7 @@ _MANUAL = """Many runs into one table: methods x settings x seeds, next to contr
 
 
 def compare(argv: list[str]) -> None:
-    """mvitac compare --plan table1|table2|ablation|FILE [--data D] [--recipe R] [--seeds N] [--jobs N] [--dry-run]"""
+    """mvitac compare --plan table1|table2|ablation|FILE [--data D] [--recipe R] [--seeds N] [--dry-run]"""
     chosen, rest = selectors(argv, ("--plan", "--data", "--recipe"))
     plan = find_plan(chosen.get("--plan", "table1"))
     options = _parse(chosen, rest, plan)
@@ -91,9 +88,9 @@ def compare(argv: list[str]) -> None:
         return
     write_json(options.out / "plan.json", to_json(plan))
     if not options.tables_only:
-        jobs = options.jobs or max(1, torch.cuda.device_count())
-        do_all(work, jobs)
-    written = write_tables(gather_folds(plan, works, options.out, config), options.out)
+        do_all(work)
+    with hold_lock(options.out / "tables", "waiting for the tables of another process", wait=True):
+        written = write_tables(gather_folds(plan, works, options.out, config), options.out)
     print(written[0].read_text(), *(f"written: {path}" for path in written), sep="\n")
 
 

@@ -1,20 +1,12 @@
-"""Run the jobs of a comparison: one by one, in several processes, or on several machines.
+"""Run the jobs of a comparison. Several processes, also on other machines, share them by locks.
 
 Jobs can be killed at any time and resume. A run whose loss became NaN or infinite counts as done and is kept as
 failed.json. A run that fails otherwise is reported, and the next call tries it again.
 """
 
-import os
-import signal
-import sys
-import threading
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from multiprocessing import get_context, parent_process
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
@@ -26,8 +18,6 @@ from mvitac.system.locks import Busy, hold_lock
 from mvitac.training.checkpoint import CHECKPOINT, PREVIOUS
 from mvitac.training.log import read_log, seconds_of
 from mvitac.training.loop import Diverged, Interrupted, train
-
-SPAWN = get_context("spawn")
 
 
 @dataclass(frozen=True)
@@ -96,78 +86,23 @@ def do(job: Job, pack: Pack | None = None, *, quiet: bool = True) -> str:
         return f"{job.seconds():.0f} s of training"
 
 
-def do_all(work: Work, num_jobs: int = 1, *, quiet: bool = False) -> None:
-    """Run the unfinished jobs and print a line about each, in ``num_jobs`` processes at a time.
+def do_all(work: Work, *, quiet: bool = False) -> None:
+    """Run the unfinished jobs that no other process has, and print a line about each.
 
-    Each process takes the jobs that no other process has, of this or another command; several GPUs are shared out among
-    them. A job that fails is told and the others go on; ValueError at the end. Interrupted after Ctrl-C, when the runs
-    under way have saved their checkpoints.
+    A job that fails is told and the others go on; ValueError at the end. Interrupted after Ctrl-C, when the run under
+    way has saved its checkpoint.
     """
-    num_jobs = min(num_jobs, sum(not job.done for job in work.jobs))
-    try:
-        if num_jobs > 1:
-            failed = _side_by_side(work.jobs, num_jobs)
-        else:
-            failed = _take(work.jobs, work, quiet=quiet)
-    except (KeyboardInterrupt, Interrupted):
-        raise Interrupted("stopped; the same command continues from here") from None
-    if failed:
-        raise ValueError(f"{failed}; the same command continues from here")
-
-
-def _take(jobs: Sequence[Job], work: Work | None = None, *, quiet: bool = True) -> str:
-    """Run the unfinished jobs that no other process has; returns the last error, or ""."""
     failed = ""
-    for job in [job for job in jobs if not job.done]:
-        pack = work.pack if work and job.run.data == work.plan.data else None
+    for job in [job for job in work.jobs if not job.done]:
         try:
-            line = do(job, pack, quiet=quiet)
-        except Interrupted:
-            raise
+            line = do(job, work.pack if job.run.data == work.plan.data else None, quiet=quiet)
+        except (KeyboardInterrupt, Interrupted):
+            raise Interrupted("stopped; the same command continues from here") from None
         except Busy as busy:
-            if work is None:  # one beside this one
-                continue
             line = str(busy)
         except Exception as error:  # do not stop the other runs
             line = f"failed: {brief(error)}"
             failed = f"{job.name} {line}"
-        print(f"[{sum(j.done for j in jobs)}/{len(jobs)}] {job.name}: {line}", flush=True)
-    return failed
-
-
-def _side_by_side(jobs: Sequence[Job], num: int) -> str:
-    """``_take`` in ``num`` processes; returns what went wrong, or ""."""
-    processes = [SPAWN.Process(target=_take_part, args=(jobs, i, num)) for i in range(num)]
-    for process in processes:
-        process.start()
-    try:
-        for process in processes:
-            process.join()
-    except KeyboardInterrupt:
-        for process in processes:
-            process.terminate()
-            process.join()
-        raise
-    if any((process.exitcode or 0) < 0 for process in processes):
-        return f"one of {num} processes was killed, most likely for lack of memory: give fewer --jobs"
-    return "some runs failed, as told above" if any(process.exitcode for process in processes) else ""
-
-
-def _take_part(jobs: Sequence[Job], index: int, num: int) -> None:
-    """``_take`` as process ``index`` of ``num``, with its share of the cores and one GPU."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    torch.set_num_threads(max(1, (os.cpu_count() or 1) // num))
-    if (gpus := torch.cuda.device_count()) > 1:
-        jobs = [replace(job, run=replace(job.run, device=f"cuda:{index % gpus}")) for job in jobs]
-    try:
-        sys.exit(bool(_take(jobs)))
-    except (Interrupted, KeyboardInterrupt):
-        sys.exit(0)  # its parent tells it
-
-
-def _end_with_parent() -> None:
-    """SIGTERM to this process when its parent has ended, so that a killed command can be started again."""
-    parent = parent_process()
-    assert parent is not None
-    parent.join()
-    os.kill(os.getpid(), signal.SIGTERM)
+        print(f"[{sum(j.done for j in work.jobs)}/{len(work.jobs)}] {job.name}: {line}", flush=True)
+    if failed:
+        raise ValueError(f"{failed}; the same command continues from here")
