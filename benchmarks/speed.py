@@ -393,6 +393,7 @@ def measure(options: argparse.Namespace, scale: Scale, batches: list[int], save:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="small trunk at 64 px, under a minute")
+    parser.add_argument("--trunk", help="another timm model, e.g. tf_efficientnet_lite0")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu", help="cpu or cuda")
     parser.add_argument(
         "--batch", type=int, nargs="+", help="pairs per batch; default 32 on a CPU, 256 and 1024 on a GPU"
@@ -411,7 +412,7 @@ def main() -> None:
         options.workers = min(16, os.cpu_count() or 1) if cuda else 0
     if options.quick:
         scale = Scale(trunk="resnet10t", size=64, batch=16, rounds=3, num_pairs=32)
-    scale = replace(scale, rounds=options.rounds or scale.rounds)
+    scale = replace(scale, rounds=options.rounds or scale.rounds, trunk=options.trunk or scale.trunk)
     keep_freed_memory()
     batches = options.batch or ([256, 1024] if cuda and not options.quick else [scale.batch])
     measure(options, scale, batches, lambda result: options.json and write_json(options.json, result))

@@ -1,16 +1,19 @@
 """Losses, convolutions and ViTs against closed forms, plain torch and timm."""
 
+import copy
+
 import pytest
 import timm
 import torch
 import torch.nn.functional as F
+from timm.layers.conv2d_same import Conv2dSame
 from timm.models.vision_transformer import VisionTransformer
 from torch import nn
 
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, build_trunk
 from mvitac.nn.losses import info_nce
 from mvitac.nn.positions import sin_cos_positions
-from mvitac.nn.small_conv import SmallMapConv2d, _Product, use_products
+from mvitac.nn.small_conv import SmallMapConv2d, _Product, use_convolutions, use_products
 from mvitac.nn.vit import encode_visible, patches, row_uniform
 from support.small_methods import slow_info_nce
 
@@ -32,6 +35,27 @@ def test_is_fp32_under_autocast() -> None:
 
 
 CHANNELS_LAST = torch.channels_last
+
+
+@pytest.mark.parametrize("same", [True, False])
+@pytest.mark.parametrize("stride", [1, 2])
+@pytest.mark.parametrize("kernel", [3, 5])
+@pytest.mark.parametrize("side", [(1, 1), (2, 2), (3, 4), (7, 8)])
+def test_depthwise_equals_the_convolution_and_its_gradients(
+    side: tuple[int, int], kernel: int, stride: int, same: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mvitac.nn.small_conv.MAX_PIXELS_DEPTHWISE", {3: 64, 5: 64})
+    shape = (6, 6, kernel, stride, 0 if same else kernel // 2)
+    theirs = (Conv2dSame if same else nn.Conv2d)(*shape, groups=6, bias=False)
+    ours = use_products(nn.Sequential(copy.deepcopy(theirs))).get_submodule("0")
+    images = torch.randn(4, 6, *side).to(memory_format=CHANNELS_LAST).requires_grad_()
+    got, want = ours(images), theirs(images)
+    assert "Depthwise" in type(got.grad_fn).__name__
+    torch.testing.assert_close(got, want)
+    towards = torch.randn_like(want)
+    mine = torch.autograd.grad(got, (images, *ours.parameters()), towards)
+    torch.testing.assert_close(mine, torch.autograd.grad(want, (images, *theirs.parameters()), towards))
+    assert type(use_convolutions(nn.Sequential(ours)).get_submodule("0")) is type(theirs)
 
 
 def layer(stride: int, dtype: torch.dtype = torch.float32) -> SmallMapConv2d:
@@ -109,7 +133,7 @@ def test_other_convolutions_stay_as_they_are() -> None:
         nn.Conv2d(4, 4, 3, padding=1, padding_mode="reflect", bias=False),
     )
     names = list(others.state_dict())
-    assert all(type(conv) is nn.Conv2d for conv in use_products(others))
+    assert all(type(conv) is nn.Conv2d for conv in use_products(others).children())
     assert list(others.state_dict()) == names
 
 

@@ -1,19 +1,29 @@
-"""3x3 convolutions over maps of a few pixels as matrix products: for training at small images on a CPU.
+"""Convolutions over maps of a few pixels, faster than oneDNN's: for training at small images on a CPU.
 
 The last stages of a ResNet at 48 px have maps of 3x3 and 2x2 pixels. oneDNN takes up to six times as long for them as
 the arithmetic needs, and up to 56 % of that is with the zeros of the padding (docs/speed.md). Here each output pixel is a
 sum of matrix products, one for each row of the kernel, over those places of the kernel that lie on the map. Operands are
-slices of the tensors as they lie in memory; nothing is copied. The same sums in another order, so equal to the
-convolution to rounding (tests/nn/test_small_conv.py).
+slices of the tensors as they lie in memory; nothing is copied.
+
+The weight gradient of a depthwise convolution takes oneDNN up to sixty times as long as its forward pass. Here it is one
+sum of products for each place of the kernel.
+
+Both are the same sums in another order, so equal to the convolution to rounding (tests/nn/test_layers.py).
 """
 
 from functools import lru_cache
 from typing import Any
 
 import torch
+from timm.layers.conv2d_same import Conv2dSame
+from timm.layers.padding import pad_same
 from torch import Tensor, nn
 
 MAX_PIXELS = 9  # of the output map, up to which products are faster than the convolution
+MAX_PIXELS_DEPTHWISE = {
+    3: 4,
+    5: 64,
+}  # the same for the weight gradient of a depthwise convolution, by its kernel's side
 
 
 class SmallMapConv2d(nn.Conv2d):
@@ -33,23 +43,64 @@ class SmallMapConv2d(nn.Conv2d):
         return _Product.apply(input, weight, stride)  # type: ignore[return-value]
 
 
+class DepthwiseConv2d(nn.Conv2d):
+    """Depthwise ``Conv2d`` with a weight gradient of its own where that pays: in fp32 training on a CPU."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        return _depthwise(self, input, self.padding[0]) if _pays(self, input) else super().forward(input)  # type: ignore[arg-type]
+
+
+class DepthwiseConv2dSame(Conv2dSame):
+    """The same for timm's convolution that pads as TensorFlow does."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        if not _pays(self, input):
+            return super().forward(input)
+        return _depthwise(self, pad_same(input, self.kernel_size, self.stride), 0)  # type: ignore[arg-type]
+
+
+def _pays(conv: Any, input: Tensor) -> bool:
+    pixels = -(-input.shape[2] // conv.stride[0]) * -(-input.shape[3] // conv.stride[0])
+    small = pixels <= MAX_PIXELS_DEPTHWISE[conv.kernel_size[0]]
+    plain = input.dtype == torch.float32 and not torch.is_autocast_enabled("cpu") and not torch.compiler.is_compiling()
+    return small and plain and conv.training and input.device.type == "cpu"
+
+
+def _depthwise(conv: Any, input: Tensor, padding: int) -> Tensor:
+    return _Depthwise.apply(input, conv.weight, conv.stride[0], padding)  # type: ignore[return-value]
+
+
+PLAIN = {SmallMapConv2d: nn.Conv2d, DepthwiseConv2d: nn.Conv2d, DepthwiseConv2dSame: Conv2dSame}
+"""Convolution of ours -> what it replaces."""
+
+
 def use_products(trunk: nn.Module) -> nn.Module:
-    """``trunk``, its plain 3x3 convolutions made ``SmallMapConv2d``; parameters and their names stay as they are."""
+    """``trunk``, its plain 3x3 and its depthwise convolutions made ours; parameters and their names stay as they are."""
     for conv in trunk.modules():
-        if type(conv) is not nn.Conv2d or conv.bias is not None or conv.groups != 1:
-            continue
-        shape = (conv.kernel_size, conv.padding, conv.dilation, conv.padding_mode)
-        if shape == ((3, 3), (1, 1), (1, 1), "zeros") and conv.stride[0] == conv.stride[1]:
-            conv.__class__ = SmallMapConv2d
+        if isinstance(conv, nn.Conv2d):
+            conv.__class__ = _ours(conv)  # type: ignore[assignment]
     return trunk
 
 
 def use_convolutions(trunk: nn.Module) -> nn.Module:
     """``trunk``, the work of ``use_products`` undone."""
     for conv in trunk.modules():
-        if type(conv) is SmallMapConv2d:
-            conv.__class__ = nn.Conv2d  # type: ignore[assignment]
+        if type(conv) in PLAIN:
+            conv.__class__ = PLAIN[type(conv)]  # type: ignore[index]
     return trunk
+
+
+def _ours(conv: nn.Conv2d) -> type[nn.Module]:
+    """The class that computes what ``conv`` does; its own if none of ours does."""
+    kind, side, same = type(conv), conv.kernel_size[0], type(conv) is Conv2dSame
+    padding = (0, 0) if same else (side // 2, side // 2)
+    shape = ((side, side), padding, (1, 1), "zeros", None, (conv.stride[0],) * 2)
+    given = (conv.kernel_size, conv.padding, conv.dilation, conv.padding_mode, conv.bias, conv.stride)
+    if kind not in (nn.Conv2d, Conv2dSame) or given != shape:
+        return kind
+    if 1 < conv.groups == conv.in_channels == conv.out_channels and side in MAX_PIXELS_DEPTHWISE:
+        return DepthwiseConv2dSame if same else DepthwiseConv2d
+    return SmallMapConv2d if side == 3 and conv.groups == 1 and not same else kind
 
 
 @lru_cache
@@ -96,3 +147,37 @@ class _Product(torch.autograd.Function):
                 of_pixels[:, under].flatten(1).addmm_(gradient[:, out], kernel[:, row, columns].flatten(1))
         of_input = None if of_pixels is None else of_pixels.unflatten(1, (height, width)).permute(0, 3, 1, 2)
         return of_input, None if of_kernel is None else of_kernel.permute(0, 3, 1, 2), None
+
+
+class _Depthwise(torch.autograd.Function):
+    """Input [B, C, H, W], weight [C, 1, K, K] -> [B, C, H', W']: torch's convolution with another weight gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, input: Tensor, weight: Tensor, stride: int, padding: int) -> Tensor:
+        ctx.save_for_backward(input, weight)
+        ctx.shape = stride, padding
+        return torch.conv2d(input, weight, None, stride, padding, 1, len(weight))
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
+        (input, weight), (stride, padding), gradient = ctx.saved_tensors, ctx.shape, gradients[0]
+        of_input = of_weight = None
+        if ctx.needs_input_grad[0]:
+            sizes = [stride] * 2, [padding] * 2, [1, 1], False, [0, 0], len(weight), [True, False, False]
+            of_input = torch.ops.aten.convolution_backward(gradient, input, weight, None, *sizes)[0]
+        if ctx.needs_input_grad[1]:
+            of_weight = torch.zeros_like(weight)
+            pixels, towards, side = input.permute(0, 2, 3, 1), gradient.permute(0, 2, 3, 1), weight.shape[-1]
+            rows = [_under(place - padding, stride, input.shape[2], towards.shape[1]) for place in range(side)]
+            columns = [_under(place - padding, stride, input.shape[3], towards.shape[2]) for place in range(side)]
+            for row, (down, above) in enumerate(rows):
+                for column, (across, left) in enumerate(columns):
+                    of_weight[:, 0, row, column] = (pixels[:, down, across] * towards[:, above, left]).sum((0, 1, 2))
+        return of_input, of_weight, None, None
+
+
+def _under(offset: int, stride: int, num_in: int, num_out: int) -> tuple[slice, slice]:
+    """(pixels in, pixels out) along one side that a place of the kernel, ``offset`` from the pixel out, joins."""
+    first, last = max(0, -(offset // stride)), min(num_out - 1, (num_in - 1 - offset) // stride)
+    start = first * stride + offset
+    return slice(start, max(start, last * stride + offset + 1), stride), slice(first, max(first, last + 1))
