@@ -54,7 +54,8 @@ from mvitac.training.step import Step
 NUM, SIDE = 48, 16
 TRAIN = "--recipe smoke --data pack --data.path {base}/pack --augment.size 16 --steps 3 --batch-size 8 --eval-every 0"
 COMMANDS = {
-    "data simulate": f"data simulate materials --num 40 --touches 1 --size {SIDE} --workers 1 --quiet --out {{out}}/p",
+    "data pack materials": f"data pack --data materials --num 40 --touches 1 --size {SIDE} --workers 1 --quiet"
+    " --out {out}/p",
     "data pack": f"data pack --data folder --path {{base}}/table --size {SIDE} --workers 1 --quiet --out {{out}}/p",
     "pretrain": f"pretrain {TRAIN} --checkpoint-every 1 --resume --quiet --out {{out}}/r",
     "finetune": "finetune {base}/run --data pack --data.path {base}/pack --lr 1e-3 --steps 2 --batch-size 8 --quiet --resume"
@@ -300,7 +301,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--num", type=int, default=100, help="flips per kind of file")
     options = parser.parse_args(argv)
     if "kills" in options.kinds:
-        for name in (*(f"mvitac.cli.{ALL[command].split(':')[0]}" for command in options.commands), *SLOW):
+        modules = {ALL[" ".join(command.split()[:2])].split(":")[0] for command in options.commands}
+        for name in (*(f"mvitac.cli.{module}" for module in modules), *SLOW):
             importlib.import_module(name)
     with tempfile.TemporaryDirectory(prefix="mvitac-faults-") as folder:
         base = Path(folder)

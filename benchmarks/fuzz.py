@@ -41,7 +41,7 @@ from mvitac.cli.main import main as mvitac
 
 READING = {
     "demo": "demo --recipe smoke --steps 1 --out {out}/d",
-    "data simulate grasps": f"data simulate grasps --num 4 --size {SIDE} --workers 1 --quiet --out {{out}}/g",
+    "data pack grasps": f"data pack --data grasps --num 4 --size {SIDE} --workers 1 --quiet --out {{out}}/g",
     "data info": "data info {base}/pack",
     "data check": "data check {base}/pack",
     "data check --data": "data check --data folder --path {base}/table --workers 1",

@@ -1,6 +1,6 @@
 """Values of simulated touches by their contact energy alone, one number per image (docs/results/force.md).
 
-    mvitac data simulate materials --contact --out packs/sim
+    mvitac data pack --data materials --contact --out packs/sim
     python examples/contact_energy.py packs/sim
 
 The energy is the mean absolute difference to the median image of the touch's sensor. Probes that score less than its curve

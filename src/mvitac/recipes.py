@@ -14,17 +14,17 @@ from mvitac.run import Optim, Run
 from mvitac.transforms.random_views import Augment, ViewAugment
 
 
-def paper(data: DatasetConfig, phased: bool | None = None) -> Run:
+def paper(data: DatasetConfig, phased: bool) -> Run:
     """The settings printed in the paper: ResNet-18 from ImageNet, Adam at lr .03 without a schedule, batch 256, 240 epochs.
 
     No grayscale views for grasping (appendix B). Needs one 24 GB GPU. The fields of ``MViTacConfig`` say which values the
     paper leaves open (m, lambda_inter, hidden width). lr .03 is very high for Adam: expect unstable training.
     """
-    views = ViewAugment(grayscale=0.0) if _is_phased(data, phased) else ViewAugment()
+    views = ViewAugment(grayscale=0.0) if phased else ViewAugment()
     return Run(recipe="paper", data=data, augment=Augment(vision=views, touch=views))
 
 
-def authors(data: DatasetConfig, phased: bool | None = None) -> Run:
+def authors(data: DatasetConfig, phased: bool) -> Run:
     """The settings of the authors' released code, without its defects.
 
     The code is https://github.com/ligerfotis/mvitac at commit a5b572d.
@@ -48,7 +48,7 @@ def authors(data: DatasetConfig, phased: bool | None = None) -> Run:
     )
 
 
-def modern(data: DatasetConfig, phased: bool | None = None) -> Run:
+def modern(data: DatasetConfig, phased: bool) -> Run:
     """Current practice. The list gives the reason and the measured effect of each change.
 
     Unless noted, effects are measured in 300 steps of `quick`'s networks with momentum keys (docs/results/ablation.md).
@@ -65,18 +65,15 @@ def modern(data: DatasetConfig, phased: bool | None = None) -> Run:
     - Rows of a touch are spread over the epoch: consecutive frames of one touch are near-duplicates and wrong as negatives.
       No difference on simulated touches, which have no consecutive frames (one seed).
     - same-touch positives: two views of one image share lamp, background and sensor, which is enough to minimise L_vv and
-      L_tt without the material (docs/simulator.md has the figures). Another row of the same touch group shares only the
-      object in the simulator, where it is another press of the same instance; in Touch and Go it is a neighbouring frame of
-      the same contact. In the simulator a neighbouring moment gains 3 points of category where another press gains 10
-      (300 steps, one seed). The largest effect: with momentum keys and all steps of `quick` 19 points of category, 7 of
-      soft, 13 of rough. Not used for grasps: the rows of a grasp differ in its phase (before, during, after), and the
-      phases differ in the contact itself.
+      L_tt without the material (docs/simulator.md). Another press of the same instance shares only the object. The largest
+      effect: with momentum keys and all steps of `quick` 19 points of category, 7 of soft, 13 of rough. A neighbouring
+      moment, as in Touch and Go, gains 3 points where another press gains 10 (300 steps, one seed). Not used for grasps:
+      their rows differ in the phase (before, during, after), and the phases differ in the contact itself.
     - All four losses, also with same-image positives: on simulated grasps, training without the intra-modal losses gains 5.7
       points (docs/results/grasps.md). This was seen on test data and is not adopted until another dataset confirms it.
     - bf16 where the hardware computes it, else fp32 (precision auto): where torch emulates bf16, a step takes ten times as
       long or more. Their scores do not differ (three seeds, docs/speed.md).
     """
-    phased = _is_phased(data, phased)
     base = paper(data, phased)
     return replace(
         base,
@@ -92,7 +89,7 @@ def modern(data: DatasetConfig, phased: bool | None = None) -> Run:
     )
 
 
-def quick(data: DatasetConfig, phased: bool | None = None) -> Run:
+def quick(data: DatasetConfig, phased: bool) -> Run:
     """`modern` for a laptop's CPU: ResNet-10 from scratch at 48 px, 1,350 steps of 32 pairs.
 
     `mvitac demo` trains it where ImageNet's weights are missing: 8 to 17 minutes on two cores without fast bf16.
@@ -121,7 +118,7 @@ def quick(data: DatasetConfig, phased: bool | None = None) -> Run:
     )
 
 
-def locked(data: DatasetConfig, phased: bool | None = None) -> Run:
+def locked(data: DatasetConfig, phased: bool) -> Run:
     """`quick` with the camera's tower locked at ImageNet (arXiv:2111.07991): touch and the heads are trained.
 
     `mvitac demo` trains this recipe where the weights are installed, in 7 minutes on two AVX2 cores. The features of the
@@ -140,7 +137,7 @@ def locked(data: DatasetConfig, phased: bool | None = None) -> Run:
     )
 
 
-def smoke(data: DatasetConfig, phased: bool | None = None) -> Run:
+def smoke(data: DatasetConfig, phased: bool) -> Run:
     """`quick` in seconds, for tests: the paper's momentum keys, a tiny trunk at 32 px, 8 steps. Scores have no meaning."""
     base = quick(data, phased)
     return replace(
@@ -158,14 +155,8 @@ def smoke(data: DatasetConfig, phased: bool | None = None) -> Run:
     )
 
 
-def _is_phased(data: DatasetConfig, phased: bool | None) -> bool:
-    """``phased`` if it is given, else what the dataset says of itself, else what its opened pack says."""
-    known = data.phased if phased is None else phased
-    return data.open(quiet=True).phased if known is None else known
-
-
 _ALL = (paper, authors, modern, quick, locked, smoke)
-RECIPES: dict[str, Callable[[DatasetConfig, bool | None], Run]] = {f.__name__: f for f in _ALL}
+RECIPES: dict[str, Callable[[DatasetConfig, bool], Run]] = {f.__name__: f for f in _ALL}
 
 
 def with_method(run: Run, method: str) -> Run:
@@ -203,4 +194,6 @@ def recipe(name: str, data: DatasetConfig | Pack | None = None, phased: bool | N
         raise unknown("recipe", name, RECIPES)
     if isinstance(data, Pack):
         data, phased = PackConfig(path=data.path), data.phased if phased is None else phased
-    return RECIPES[name](data or default(DatasetConfig, "materials"), phased)
+    data = data or default(DatasetConfig, "materials")
+    phased = data.phased if phased is None else phased
+    return RECIPES[name](data, data.open(quiet=True).phased if phased is None else phased)

@@ -104,17 +104,14 @@ def from_json(annotation: Any, value: Any, where: str = "run") -> Any:
         return value
     if origin is tuple:
         return _tuple_from_json(arguments, value, where)
-    if origin is dict:
-        return {key: from_json(arguments[1], v, f"{where}.{key}") for key, v in _object(value, where).items()}
-    if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
-        return _dataclass_from_json(annotation, _object(value, where), where)
-    return _scalar_from_json(annotation, value, where)
-
-
-def _object(value: Any, where: str) -> dict[str, Any]:
-    if not isinstance(value, dict):
+    nested = isinstance(annotation, type) and dataclasses.is_dataclass(annotation)
+    if (origin is dict or nested) and not isinstance(value, dict):
         raise ValueError(f"{where}: expected an object, got {value!r}")
-    return dict(value)
+    if origin is dict:
+        return {key: from_json(arguments[1], v, f"{where}.{key}") for key, v in value.items()}
+    if nested:
+        return _dataclass_from_json(annotation, dict(value), where)
+    return _scalar_from_json(annotation, value, where)
 
 
 def _tuple_from_json(types_: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
@@ -132,22 +129,21 @@ def _dataclass_from_json(cls: type, given: dict[str, Any], where: str) -> Any:
         if not isinstance(name, str):
             raise ValueError(f"{where}.name: expected one of {', '.join(cls.choices)}, got {name!r}")
         cls = find(cls, name)
-    fields, hints = dataclasses.fields(cls), typing.get_type_hints(cls)  # type: ignore[arg-type]
-    names = sorted(field.name for field in fields)
+    names, hints = sorted(field.name for field in dataclasses.fields(cls)), typing.get_type_hints(cls)  # type: ignore[arg-type]
     for key in given:
         if key not in names:
             raise unknown(f"field in {where}", key, names)
-    for field in fields:
-        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-        if required and field.name not in given:
-            raise ValueError(f"{where}: field {field.name!r} is missing")
-    return cls(**{key: from_json(hints[key], v, f"{where}.{key}") for key, v in given.items()})
+    values = {key: from_json(hints[key], v, f"{where}.{key}") for key, v in given.items()}
+    try:
+        return cls(**values)
+    except TypeError as error:  # which names the fields that are missing
+        raise ValueError(f"{where}: {error}") from None
 
 
 def _scalar_from_json(annotation: Any, value: Any, where: str) -> Any:
     if annotation is Path:
-        if not isinstance(value, str) or "\0" in value:
-            raise ValueError(f"{where}: expected a path (text without NUL characters), got {value!r}")
+        if not isinstance(value, str):
+            raise ValueError(f"{where}: expected a path, got {value!r}")
         return Path(value)
     if annotation is float and isinstance(value, int) and not isinstance(value, bool):
         if abs(value) > 1 << 1000:

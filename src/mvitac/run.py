@@ -13,7 +13,7 @@ from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders
 from mvitac.nn.initial import Init
-from mvitac.registry import from_json, to_json
+from mvitac.registry import check_range, from_json, to_json
 from mvitac.system.files import digest, read_json
 from mvitac.transforms.random_views import Augment, ViewAugment
 
@@ -44,14 +44,9 @@ class Optim:
     """Fraction of the steps during which the learning rate rises linearly from zero."""
 
     def __post_init__(self) -> None:
-        if not (self.lr > 0 and math.isfinite(self.lr)):
-            raise ValueError(f"optim lr {self.lr}: give a positive learning rate")
-        if not (self.eps > 0 and math.isfinite(self.eps)):
-            raise ValueError(f"optim eps {self.eps}: give a positive number")
-        if not (self.weight_decay >= 0 and math.isfinite(self.weight_decay)):
-            raise ValueError(f"optim weight_decay {self.weight_decay}: give a number >= 0")
-        if not 0 <= self.warmup < 1:
-            raise ValueError(f"optim warmup {self.warmup}: give a fraction of the steps in [0, 1)")
+        check_range(self, 1e-30, math.inf, "lr", "eps")
+        check_range(self, 0, math.inf, "weight_decay")
+        check_range(self, 0, 0.99, "warmup")
 
     def rate(self, step: int, num_steps: int, epoch: int) -> float:
         """Learning rate of step ``step`` (counted from 0) out of ``num_steps``."""
@@ -125,31 +120,21 @@ class Run:
     log_every: Fixed[int] = 10
     """Steps between log lines. Each also checks that the loss is finite."""
     eval_every: int = 0
-    """Steps between evaluations (linear probes, kNN, signs of collapse) on held-out groups (split val, never test). The
+    """Steps between evaluations (linear probes, signs of collapse) on held-out groups (split val, never test). The
     weights that are best there are kept as model.best.safetensors. 0 = only at the start and the end."""
     checkpoint_every: int = 0
     """Steps between checkpoints. 0 = about every tenth of the run, at least 10 steps apart."""
 
     def __post_init__(self) -> None:
-        if self.batch_size < 2:
-            raise ValueError(f"batch_size {self.batch_size}: give at least 2 pairs, as each needs a negative")
-        if not (self.epochs > 0 and math.isfinite(self.epochs)):
-            raise ValueError(f"epochs {self.epochs}: give a positive number")
+        check_range(self, 2, math.inf, "batch_size")  # each pair needs a negative
+        check_range(self, 1e-30, math.inf, "epochs")
+        check_range(self, 0, math.inf, "positives_within", "eval_every", "checkpoint_every")
+        check_range(self, 1, math.inf, "log_every", *["steps"] * (self.steps is not None))
+        check_range(self, 0, (1 << 63) - 1, "seed")
         if self.chunk and not (2 <= self.chunk <= self.batch_size and self.batch_size % self.chunk == 0):
             raise ValueError(f"chunk {self.chunk}: give a divisor of batch_size {self.batch_size}, at least 2, or 0")
-        if not 0 <= self.positives_within < math.inf:
-            raise ValueError(f"positives_within {self.positives_within}: give a number of frames >= 0")
         if self.positives_within and self.positives == "same-image":
             raise ValueError("positives_within has no effect on same-image positives: choose --positives same-touch")
-        if self.steps is not None and self.steps < 1:
-            raise ValueError(f"steps {self.steps}: give at least 1, or leave it out to use epochs")
-        if not 0 <= self.seed < 1 << 63:
-            raise ValueError(f"seed {self.seed}: give a number from 0 to 2^63 - 1")
-        if self.log_every < 1:
-            raise ValueError(f"log_every {self.log_every}: give at least 1")
-        for name, value in (("eval_every", self.eval_every), ("checkpoint_every", self.checkpoint_every)):
-            if value < 0:
-                raise ValueError(f"{name} {value}: give a number of steps >= 0")
 
     def num_steps(self, num_rows: int) -> int:
         """Number of optimiser steps of the whole run on ``num_rows`` training rows."""
@@ -164,16 +149,9 @@ class Run:
 
         ``num_rows`` is the number of training rows, ``stored_size`` the side in pixels of the pack's images.
         """
-        if num_rows < 2:
-            raise ValueError(
-                f"dataset {spec.name!r} has {num_rows or 'no'} rows in split train or unlabelled:"
-                " pre-training needs at least 2"
-            )
         if num_rows < self.batch_size:
-            raise ValueError(
-                f"dataset {spec.name!r} has {num_rows} rows to train on, batch_size is {self.batch_size}:"
-                f" give --batch-size {num_rows} or less"
-            )
+            what = f"dataset {spec.name!r} has {num_rows} rows to train on, batch_size is {self.batch_size}"
+            raise ValueError(f"{what}: give --batch-size {num_rows} or less" if num_rows > 1 else f"{what}: too few")
         if (self.steps or self.epochs * self.steps_per_epoch(num_rows)) > MAX_STEPS:
             given = f"steps {self.steps}" if self.steps else f"epochs {self.epochs}"
             raise ValueError(f"{given}: too many to finish on any machine, give at most {MAX_STEPS} steps in all")
@@ -186,15 +164,11 @@ class Run:
         encoder, size = self.encoder[modality], self.augment.size_of(modality)
         # Whole images may be enlarged: a network that learned on large ones sees more in them (docs/start.md).
         if size > stored_size and not self.augment.of(modality).fixed:
-            raise ValueError(
-                f"{modality} of {size} px cannot be cut from images stored at {stored_size} px:"
-                f" give --augment.size {stored_size} or less, or pack at a larger --data.size"
-            )
+            what = f"{modality} of {size} px cannot be cut from images stored at {stored_size} px"
+            raise ValueError(f"{what}: give --augment.size {stored_size} or less, or pack at a larger --data.size")
         if encoder.temporal != "stack" and spec.window.frames == 1:
-            raise ValueError(
-                f"encoder.{modality}.temporal {encoder.temporal} has no effect on single images: give --data.num-frames 2"
-                " or more, or leave it out"
-            )
+            what = f"encoder.{modality}.temporal {encoder.temporal} has no effect on single images"
+            raise ValueError(f"{what}: give --data.num-frames 2 or more, or leave it out")
         taken = self.init and modality in (self.init.modalities or spec.modalities)
         if encoder.locked and encoder.weights == SCRATCH and not taken:
             raise ValueError(f"{modality} is locked at random weights: give --encoder.{modality}.weights, or --init")
@@ -207,10 +181,7 @@ class Run:
         return self.precision == "bf16"
 
     def without_idle(self, spec: DataSpec) -> "Run":
-        """This run with every setting that has no effect on the dataset at a fixed value.
-
-        Two runs that train alike on the dataset become equal.
-        """
+        """This run with every setting that has no effect on the dataset at a fixed value: of two that train alike, one."""
         unseen = {m: ViewAugment() for m in ("vision", "touch") if m not in spec.modalities}
         encoder = replace(self.encoder, **dict.fromkeys(unseen, EncoderConfig()))
         augment = replace(self.augment, **unseen)
@@ -237,12 +208,11 @@ class Run:
 
 
 def load_run(path: Path) -> tuple[Run, dict[str, Any]]:
-    """Read the run.json in the folder of a run. Returns the ``Run`` and the whole record."""
-    return read_record(path / "run.json")
+    """Read a run.json, or that in the folder of a run: the ``Run`` and the whole record.
 
-
-def read_record(file: Path) -> tuple[Run, dict[str, Any]]:
-    """Read a run.json: the ``Run`` and the whole record. ValueError names the file and the field that is wrong."""
+    ValueError names the file and the field that is wrong.
+    """
+    file = path / "run.json" if path.is_dir() else path
     record = read_json(file, "a run's record")
     if not isinstance(record, dict) or "run" not in record:
         raise ValueError(f"{file} is not a run's record: give the run.json that `mvitac pretrain` wrote")
@@ -253,5 +223,5 @@ def read_record(file: Path) -> tuple[Run, dict[str, Any]]:
 
 
 def precision_of(run: Run, record: dict[str, Any]) -> str:
-    """The precision that a recorded run was computed in, with ``auto`` resolved. Older records have no such entry."""
+    """The precision that a recorded run was computed in, with ``auto`` resolved."""
     return record.get("precision", run.precision)

@@ -107,13 +107,12 @@ def trap(name: str) -> Callable[..., Any]:
 
 
 PRETRAIN = "pretrain --recipe smoke --data pack --data.path {pack} --quiet --out {out} "
-SIMULATE = "data simulate materials --size 16 --quiet --out {out} "
+SIMULATE = "data pack --data materials --size 16 --quiet --out {out} "
 PACKED = "data pack --data folder --path {tmp}/presses.csv --touch-group press --group thing --out {out} "
 
 # A command, its wrong words, and what the message must hold.
 WORDS: list[tuple[str, str, str]] = [
     ("", "pretrian", "did you mean 'pretrain'"),
-    ("", "data simulate graps --out {out}", "did you mean 'grasps'"),
     ("", "data pack --data materails --out {out}", "did you mean 'materials'"),
     ("", "data info {tmp}/nowhere", "no pack at {tmp}/nowhere"),
     ("", "pretrain --data {tmp}/pairs.csv --out {out}", "{tmp}/pairs.csv does not exist"),
@@ -205,8 +204,8 @@ def impossible(config: Any, start: str) -> Iterator[tuple[str, str]]:
 
 FIELDS = [
     *impossible(replace(recipe("smoke", PackConfig(), phased=False), method=MViTacConfig()), PRETRAIN.strip()),
-    *impossible(MaterialsConfig(), "data simulate materials --out {out}"),
-    *impossible(GraspsConfig(), "data simulate grasps --out {out}"),
+    *impossible(MaterialsConfig(), "data pack --data materials --out {out}"),
+    *impossible(GraspsConfig(), "data pack --data grasps --out {out}"),
 ]
 
 

@@ -10,12 +10,8 @@ import pytest
 
 from mvitac.cli.main import COMMANDS, help_file, main
 
-WITHOUT_OPTIONS = ("data simulate",)
-"""Commands that have a short text of their own."""
-TYRO = [name for name in COMMANDS if name not in WITHOUT_OPTIONS]
 
-
-@pytest.mark.parametrize("command", TYRO)
+@pytest.mark.parametrize("command", COMMANDS)
 def test_help_is_golden(command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Every option with its default and meaning. After a wanted change: MVITAC_GOLDEN=1 pytest -k golden"""
     monkeypatch.setenv("COLUMNS", "80")
@@ -37,7 +33,7 @@ def test_help_is_golden(command: str, capsys: pytest.CaptureFixture[str], monkey
 def test_help_imports_nothing_heavy() -> None:
     code = (
         "import sys; from mvitac.cli.main import COMMANDS, main\n"
-        f"assert not any(main([*name.split(), '--help']) for name in {['', *TYRO]!r})\n"
+        f"assert not any(main([*name.split(), '--help']) for name in {['', *COMMANDS]!r})\n"
         "sys.exit(bool({'torch', 'tyro', 'numpy', 'rich'} & set(sys.modules)))"
     )
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
@@ -45,4 +41,4 @@ def test_help_imports_nothing_heavy() -> None:
 
 def test_no_help_is_left_behind() -> None:
     """A command that is gone has no file."""
-    assert {path.stem for path in help_file("").parent.glob("*.txt")} == {name.replace(" ", "-") for name in TYRO}
+    assert {path.stem for path in help_file("").parent.glob("*.txt")} == {name.replace(" ", "-") for name in COMMANDS}

@@ -119,7 +119,7 @@ def test_a_missing_image_has_no_bytes(tmp_path: Path) -> None:
 
 
 def test_the_command_line_and_the_cache(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["data", "simulate", "materials", "--num", "20", "--size", "16", "--workers", "1", "--quiet"]
+    words = ["data", "pack", "--data", "materials", "--num", "20", "--size", "16", "--workers", "1", "--quiet"]
     assert main([*words, "--store", "jpeg", "--out", str(tmp_path / "p")]) == 0
     assert main(["data", "info", str(tmp_path / "p")]) == 0
     assert "JPEG of quality 95" in " ".join(capsys.readouterr().out.split())

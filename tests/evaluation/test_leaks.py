@@ -1,7 +1,6 @@
 """What a run learned from, or its owner says so, is compared with what is scored: refused, or LEAK beside every score."""
 
 import json
-import re
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -242,19 +241,12 @@ def test_summaries_and_folds_keep_the_leak() -> None:
     assert unseen_groups("object", [pooled]) == "test objects" and unseen_groups("object", [record]) == "unseen objects"
 
 
-def test_scores_show_themselves_in_a_notebook(run: Path, turned: Pack) -> None:
-    """``mvitac.probe`` scores as the command does, and its result is a table with intervals, groups and leaks."""
+def test_python_scores_as_the_command_does(run: Path, turned: Pack) -> None:
     scores = mvitac.probe(run, tasks=("pattern",), modalities=("touch",))
-    cell = scores["summary"]["pattern"]["touch"]["mvitac"]
     assert read_json(run / "probe.json", "a probe result")["summary"] == json.loads(json.dumps(scores["summary"]))
-    page = re.sub(" +<", "<", scores._repr_html_())
-    assert f"<td>{with_interval(cell['mean'], cell['low'], cell['high'])}</td>" in page
-    assert "<th>touch</th>" in page and "<td>majority</td>" in page and f"{cell['groups']} test instances" in page
     with pytest.raises(ValueError, match="allow-leak"):
         mvitac.probe(run, on=turned)
-    page = mvitac.probe(run, on=turned, allow_leak=True, controls=False)._repr_html_()
-    page = re.sub(" +<", "<", page)
-    assert f"retrieval: {ALL}</p>" in page and "LEAK</td>" in page
+    assert f"retrieval: {ALL}" in " ".join(mvitac.probe(run, on=turned, allow_leak=True, controls=False)["leaks"])
 
 
 SAID = [

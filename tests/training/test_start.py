@@ -21,12 +21,12 @@ from mvitac.methods.byol import BYOLConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.model import fresh, load
 from mvitac.nn.encoders import Encoders, PerFrame, build_trunk
-from mvitac.nn.initial import Init, load_trunk
+from mvitac.nn.initial import Init
 from mvitac.nn.momentum import Momentum
 from mvitac.nn.weights import adapt_stem
 from mvitac.run import Run, load_run
 from mvitac.training.loop import train
-from mvitac.training.start import describe, load_start, read_start
+from mvitac.training.start import describe, load_start, load_trunk, read_start
 from support.toy import toy_pack
 from support.training_runs import assert_equal_weights, power_cut, smoke, weights
 

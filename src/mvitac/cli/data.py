@@ -17,8 +17,6 @@ from mvitac.data.pack_table import SPLITS
 from mvitac.data.spec import Task, Window, listed
 from mvitac.datasets.base import DatasetConfig, dataset
 from mvitac.datasets.mix import open_packs
-from mvitac.datasets.simulated import SimulatedConfig
-from mvitac.registry import default, unknown
 from mvitac.system.files import check_place, write_atomic
 
 
@@ -33,20 +31,6 @@ class _BuildOptions:
     """No progress bar."""
 
 
-def simulate(argv: list[str]) -> None:
-    """mvitac data simulate materials|grasps|taxim --num ... --size ... --seed ... --out DIR"""
-    names = sorted(name for name, cls in DatasetConfig.choices.items() if issubclass(cls, SimulatedConfig))
-    usage = f"mvitac data simulate {'|'.join(names)} --out DIR"
-    if not argv or argv[0].startswith("-"):
-        if asks_help(argv):
-            print(f"usage: {usage}\n\nThe options of one: mvitac data simulate KIND --help")
-            return
-        raise ValueError(f"name what to simulate: {usage}")
-    if argv[0] not in names:
-        raise unknown("kind to simulate", argv[0], names)
-    _build(default(SimulatedConfig, argv[0]), argv[1:], f"data simulate {argv[0]}")
-
-
 def pack(argv: list[str]) -> None:
     """mvitac data pack --data NAME ... --out DIR"""
     chosen, rest = selectors(argv, ("--data",))
@@ -56,19 +40,15 @@ def pack(argv: list[str]) -> None:
             print(f"usage: {usage}\n\nThe options of one: mvitac data pack --data NAME --help")
             return
         raise ValueError(f"name the dataset: {usage}")
-    _build(dataset(chosen["--data"]), rest, f"data pack --data {chosen['--data']}")
-
-
-def _build(config: Any, argv: list[str], prog: str) -> None:
+    config: Any = dataset(chosen["--data"])
     usual = _BuildOptions(out=tyro.MISSING, data=config)
-    options = parse(_BuildOptions, argv, prog, default=usual, description=type(config).__doc__ or "")
+    prog = f"data pack --data {chosen['--data']}"
+    options = parse(_BuildOptions, rest, prog, default=usual, description=type(config).__doc__ or "")
     check_place(options.out)
     data: Any = options.data
     if data.frame_window() != Window():
-        raise ValueError(
-            "a pack stores every frame once, so options of windows (--num-frames, --stride, ...) have no effect here:"
-            " leave them out, and give them to the commands that read the pack"
-        )
+        what = "a pack stores every frame once: leave out options of windows (--num-frames, --stride, ...)"
+        raise ValueError(f"{what}, and give them to the commands that read the pack")
     given = {"max_damaged": options.max_damaged, "quiet": options.quiet, **data.build_options()}
     pack = build(data.source(), options.out, **given)
     print(f"{pack.path}: {pack.num} samples at {pack.size} px")

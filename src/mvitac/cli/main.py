@@ -17,7 +17,6 @@ HELP = (Path(__file__).parent / "help.txt").read_text(encoding="utf-8")
 
 COMMANDS = {
     "demo": "demo:demo",
-    "data simulate": "data:simulate",
     "data pack": "data:pack",
     "data info": "data:info",
     "data check": "data_check:check",

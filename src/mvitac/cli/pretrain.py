@@ -10,7 +10,7 @@ from mvitac.cli.options import asks_help, parse, selectors
 from mvitac.datasets.base import DatasetConfig, dataset
 from mvitac.methods.base import MethodConfig
 from mvitac.recipes import RECIPES, recipe, with_method
-from mvitac.run import Run, read_record
+from mvitac.run import Run, load_run
 from mvitac.system.distributed import join
 from mvitac.training.log import LOGGERS, open_loggers
 from mvitac.training.loop import train
@@ -53,7 +53,7 @@ def pretrain(argv: list[str]) -> None:
         options = parse(_Options, rest, "pretrain", default=replace(usual, run=_chosen_run(chosen, pack.phased)))
     with open_loggers(chosen.get("--logger"), options.out, options.run) as loggers:
         out = train(options.run, options.out, resume=options.resume, quiet=options.quiet, loggers=loggers, pack=pack)
-    data = read_record(out / "run.json")[1].get("data", {})
+    data = load_run(out)[1].get("data", {})
     known = "probe" if data.get("tasks") or data.get("values") else "report"
     print(f"trained: {out}\nnext: mvitac {known} {out}")
 
@@ -67,7 +67,7 @@ def _chosen_run(chosen: dict[str, str], phased: bool) -> Run:
         for name in ("--method", "--data", "--recipe"):
             if name in chosen:
                 raise ValueError(f"--from already decides {name}: leave it out, or change single fields")
-        return read_record(Path(chosen["--from"]))[0]
+        return load_run(Path(chosen["--from"]))[0]
     data = dataset(chosen.get("--data", "materials"))
     base = recipe(chosen.get("--recipe", "quick"), data, phased if data.phased is None else data.phased)
     return with_method(base, chosen.get("--method", base.method.name))

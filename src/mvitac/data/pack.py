@@ -73,7 +73,7 @@ class Pack:
     def _read_meta(self) -> dict[str, Any]:
         """Return the content of pack.json; ValueError unless it describes a pack that this version reads."""
         if not self.path.is_dir():
-            raise ValueError(f"no pack at {self.path}: make one with `mvitac data simulate` or `mvitac data pack`")
+            raise ValueError(f"no pack at {self.path}: make one with `mvitac data pack`")
         meta = read_json(path := self.path / "pack.json", "a pack's description")
         if not isinstance(meta, dict) or meta.get("format") != FORMAT:
             raise ValueError(f"{path} does not describe a pack: choose a folder `mvitac data` wrote")

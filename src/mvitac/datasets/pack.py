@@ -13,7 +13,7 @@ ON_VAL = "scores are on split val (--data.score-on val); split test is hidden"
 
 @dataclass(frozen=True, kw_only=True)
 class PackConfig(DatasetConfig):
-    """A folder written by ``mvitac data simulate`` or ``mvitac data pack``."""
+    """A folder written by ``mvitac data pack``."""
 
     name: ClassVar[str] = "pack"
 

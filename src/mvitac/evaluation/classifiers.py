@@ -16,12 +16,11 @@ from sklearn.linear_model import LogisticRegression
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
-from mvitac.evaluation.diagnostics import knn_votes
-
 Classifier = Callable[[np.ndarray], np.ndarray]
 
 UNSEEN = -1e4  # logit of a class without training examples: probability 0 in fp32, and still finite in fp16
 STRENGTHS = (0.001, 0.01, 0.1, 1.0)  # candidate values of C, the inverse regularisation strength of logistic regression
+NEIGHBOURS = 20
 EPOCHS, BATCH, DROPOUT = 60, 256, 0.2  # training settings of the paper's probe (appendix A)
 
 
@@ -69,9 +68,8 @@ class Constant:
 
     def weights(self) -> tuple[np.ndarray, np.ndarray]:
         """As of ``Logistic``."""
-        return np.zeros((self.num_classes, self.width)), np.where(
-            np.arange(self.num_classes) == self.label, 0.0, UNSEEN
-        )
+        bias = np.where(np.arange(self.num_classes) == self.label, 0.0, UNSEEN)
+        return np.zeros((self.num_classes, self.width)), bias
 
 
 def fit_linear(
@@ -106,7 +104,9 @@ def train_heads(features: Tensor, labels: Tensor, num_classes: Sequence[int], se
     """
     (num, width), device = features.shape, features.device
     stream = torch.Generator(device).manual_seed(seed)
-    weight = torch.cat([_initial_weight(k, width, seed) for k in num_classes]).to(device).requires_grad_()
+    # Initial weights depend on the seed alone, not on the other tasks.
+    starts = [torch.rand(k, width, generator=torch.Generator().manual_seed(seed)) for k in num_classes]
+    weight = ((torch.cat(starts) * 2 - 1) * width**-0.5).to(device).requires_grad_()
     bias = torch.zeros(sum(num_classes), device=device, requires_grad=True)
     optimiser = torch.optim.Adam([weight, bias], lr=1e-4, eps=1e-7, fused=device.type in ("cpu", "cuda"))
     labels = labels.to(device)
@@ -122,29 +122,25 @@ def train_heads(features: Tensor, labels: Tensor, num_classes: Sequence[int], se
     return list(torch.cat([weight.detach(), bias.detach()[:, None]], dim=1).cpu().split(list(num_classes)))
 
 
-def _initial_weight(num_classes: int, width: int, seed: int) -> Tensor:
-    """Initial weight of one head. It depends on the seed alone, not on the other tasks."""
-    generator = torch.Generator().manual_seed(seed)
-    return (torch.rand(num_classes, width, generator=generator) * 2 - 1) * width**-0.5
-
-
 def fit_papers(x: np.ndarray, ys: list[np.ndarray], num_classes: list[int], seed: int) -> list[Classifier]:
     """Fit the paper's probe for several tasks on the same rows; returns one classifier per task."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     labels = torch.from_numpy(np.stack(ys)).long()
     heads = train_heads(torch.from_numpy(x).float().to(device), labels, num_classes, seed)
-    return [partial(_linear_probabilities, head=head.numpy()) for head in heads]
 
+    def probabilities(z: np.ndarray, head: np.ndarray) -> np.ndarray:
+        return np.asarray(torch.softmax(torch.from_numpy(z @ head[:, :-1].T + head[:, -1]), 1))
 
-def _linear_probabilities(z: np.ndarray, head: np.ndarray) -> np.ndarray:
-    return np.asarray(torch.softmax(torch.from_numpy(z @ head[:, :-1].T + head[:, -1]), 1))
+    return [partial(probabilities, head=head.numpy()) for head in heads]
 
 
 def fit_knn(x: np.ndarray, y: np.ndarray, num_classes: int) -> Classifier:
-    """Weighted vote of the 20 nearest rows by cosine (``diagnostics.knn_votes``); returns vote shares."""
+    """Vote shares of the 20 nearest rows by cosine, with weight exp(cosine / .07) (arXiv:1805.01978, section 3.4)."""
+    known, labels = F.normalize(torch.from_numpy(x).float(), dim=1), torch.from_numpy(y).long()
 
     def shares(z: np.ndarray) -> np.ndarray:
-        votes = knn_votes(torch.from_numpy(x), torch.from_numpy(y).long(), torch.from_numpy(z), num_classes)
+        near = (F.normalize(torch.from_numpy(z).float(), dim=1) @ known.T).topk(min(NEIGHBOURS, len(known)), dim=1)
+        votes = torch.zeros(len(z), num_classes).scatter_add_(1, labels[near.indices], (near.values / 0.07).exp())
         return (votes / votes.sum(1, keepdim=True)).numpy()
 
     return shares

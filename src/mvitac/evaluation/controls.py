@@ -13,15 +13,7 @@ import torch.nn.functional as F
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import MODALITIES, AnyTask, DataSpec, Task
-from mvitac.evaluation.probe import (
-    names_in,
-    probe_all,
-    probe_features,
-    probe_model,
-    probes_of,
-    score_rows,
-    split_rows,
-)
+from mvitac.evaluation.probe import names_in, probe_all, probe_features, probe_model, probes_of, score_rows, split_rows
 from mvitac.evaluation.probe_config import Standardise
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.methods.simclr import SimCLRConfig

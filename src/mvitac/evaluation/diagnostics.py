@@ -1,4 +1,4 @@
-"""Measures of feature quality and collapse: spread, rank, alignment, modality gap, kNN accuracy, retrieval.
+"""Measures of feature quality and collapse: spread, rank, alignment, modality gap, a linear probe, retrieval.
 
 Shapes: features [N, D] of one modality. Row i of vision and row i of touch are a pair.
 """
@@ -52,30 +52,6 @@ def modality_gap(a: Float[Tensor, "N D"], b: Float[Tensor, "M D"]) -> float:
     Source: https://arxiv.org/abs/2203.02053 (Liang et al., section 2).
     """
     return float((F.normalize(a.float(), dim=1).mean(0) - F.normalize(b.float(), dim=1).mean(0)).norm())
-
-
-def knn_accuracy(
-    train: Float[Tensor, "N D"],
-    train_labels: Int[Tensor, " N"],
-    test: Float[Tensor, "M D"],
-    test_labels: Int[Tensor, " M"],
-    k: int = 20,
-) -> float:
-    """kNN accuracy: the class with most of the ``knn_votes``."""
-    votes = knn_votes(train, train_labels, test, int(max(train_labels.max(), test_labels.max())) + 1, k)
-    return float((votes.argmax(1) == test_labels).float().mean())
-
-
-def knn_votes(
-    train: Float[Tensor, "N D"], labels: Int[Tensor, " N"], test: Float[Tensor, "M D"], num_classes: int, k: int = 20
-) -> Float[Tensor, "M K"]:
-    """Votes of the ``k`` nearest ``train`` rows for each class, with weight exp(cosine / .07).
-
-    Source: https://arxiv.org/abs/1805.01978 (Wu et al., section 3.4).
-    """
-    near = (F.normalize(test.float(), dim=1) @ F.normalize(train.float(), dim=1).T).topk(min(k, len(train)), dim=1)
-    votes = torch.zeros(len(test), num_classes)
-    return votes.scatter_add_(1, labels[near.indices], (near.values / 0.07).exp())
 
 
 ALPHAS = (10.0, 100.0, 1e3, 1e4, 1e5)  # candidate strengths of the ridge regularisation of ``linear_probe``

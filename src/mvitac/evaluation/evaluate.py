@@ -3,11 +3,8 @@
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
-from html import escape
 from pathlib import Path
 from typing import Any
-
-from tabulate import tabulate
 
 from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack
@@ -19,11 +16,10 @@ from mvitac.evaluation.encoders import Bound, open_encoders, probe_encoders
 from mvitac.evaluation.features import fitting
 from mvitac.evaluation.folds import fold_splits
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
-from mvitac.evaluation.probe import PROBES, probe_model, probes_of, seen_by, split_rows
+from mvitac.evaluation.probe import probe_model, probes_of, seen_by, split_rows
 from mvitac.evaluation.probe_config import ProbeConfig
 from mvitac.evaluation.retrieval import cross_modal, retrieved_rows
 from mvitac.evaluation.run_names import names_of
-from mvitac.evaluation.score_text import columns_of, covered, score_name, score_rows, tested_on
 from mvitac.evaluation.scores import per_class, pool, summarise
 from mvitac.evaluation.sensors import about_new, describe_statistics
 from mvitac.model import Model, Which, load, weights_file
@@ -40,21 +36,9 @@ END_TO_END = ", end to end"
 """Suffix of a source's name for the scores of its own heads, trained along with its encoders."""
 
 
-class Scores(dict[str, Any]):
-    """The result of probing runs (see ``probe_runs``). A notebook shows it as one table per task."""
-
-    def _repr_html_(self) -> str:
-        parts = []
-        for name, task in self["summary"].items():
-            heads = [f"{name}, {score_name(task)} %, {tested_on(task, self['group_by'])}", *columns_of(task)]
-            rows = score_rows(task, columns_of(task))
-            parts.append(tabulate(rows, heads, tablefmt="html", disable_numparse=True))
-        lines = [f"95 % intervals: {covered(self['group_by'], self['records'])}."]
-        lines += [*self["notes"], *(f"LEAK: {leak}" for leak in self["leaks"])]
-        return "".join(parts) + "".join(f"<p>{escape(line)}</p>" for line in lines)
-
-
-def probe(*runs: str | Path, on: str | Path | Pack | None = None, allow_leak: bool = False, **options: Any) -> Scores:
+def probe(
+    *runs: str | Path, on: str | Path | Pack | None = None, allow_leak: bool = False, **options: Any
+) -> dict[str, Any]:
     """Probe finished runs beside their controls, as `mvitac probe` does. Public as ``mvitac.probe``.
 
     Args:
@@ -64,7 +48,7 @@ def probe(*runs: str | Path, on: str | Path | Pack | None = None, allow_leak: bo
         options: Fields of ``ProbeConfig``: probes, tasks, modalities, controls, fractions, folds.
 
     Returns:
-        The scores, a dict (see ``probe_runs``).
+        The scores (see ``probe_runs``).
 
     Raises:
         ValueError: As ``probe_runs``.
@@ -85,14 +69,14 @@ def probe_runs(
     allow_leak: bool = False,
     weights: Which = "last",
     encoders: Sequence[str] = (),
-) -> Scores:
+) -> dict[str, Any]:
     """Probe finished runs and their controls, and write the result to probe.json in the folder of each run, as ``probe``.
 
     ``weights`` are those after the last step, or the best on split val, whose result is in probe.best.json; that of folds
     is in probe.folds.json. ``encoders`` are other people's to probe beside the runs ("external:..."); they need ``pack``.
 
     Returns:
-        Scores, a dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary",
+        A dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary",
         "per_class", "asked" (the config), "models" (digests of the weights) and "encoders" (``ExternalModel.describe``).
         A record has a "leak", which is empty unless its test rows, or their groups, were trained on.
 
@@ -134,7 +118,7 @@ def probe_runs(
     for path in (path for path in paths if path != BASE):  # nothing is written into the package
         name = "probe" + ".best" * (weights == "best") + ".folds" * bool(session.folds)
         write_json(path / f"{name}.json", result, sealed=True)
-    return Scores(result)
+    return result
 
 
 def _check_paths(paths: Sequence[Path], encoders: Sequence[str]) -> None:
@@ -292,16 +276,13 @@ def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[AnyTask], list[str]]:
     """The tasks and modalities that ``session`` asks for; ValueError if the data lacks one."""
     known = {task.name: task for task in pack.spec.all_tasks}
     if not known:
-        raise ValueError(
-            f"dataset {pack.spec.name!r} has no labels and no values: name columns with --data.labels or --data.values"
-        )
+        what = f"dataset {pack.spec.name!r} has no labels and no values"
+        raise ValueError(f"{what}: name columns with --data.labels or --data.values")
     for name in session.tasks:
         if name not in known:
             raise unknown("task", name, known)
-    have = [*pack.spec.modalities, *(["both"] if len(pack.spec.modalities) == 2 else [])]
+    have = [*pack.spec.modalities, *["both"] * (len(pack.spec.modalities) == 2)]
     for modality in session.modalities:
         if modality not in have:
             raise unknown("modality", modality, have)
-    if not session.probes:
-        raise ValueError(f"no probe given: choose from {', '.join(PROBES)}")
     return [known[name] for name in session.tasks or known], list(session.modalities or have)

@@ -21,7 +21,6 @@ from mvitac.evaluation.scores import score
 from mvitac.evaluation.sensors import touch_features
 from mvitac.evaluation.value_scores import score_values
 from mvitac.model import Model
-from mvitac.registry import unknown
 from mvitac.system.progress import tick
 
 PROBES = ("linear", "paper", "knn")
@@ -144,14 +143,18 @@ def fit_and_score(
 def fit_probe(
     x: np.ndarray, pack: Pack, task: AnyTask, rows: ProbeSplit, kind: str, seed: int, paper: Classifier | None = None
 ) -> tuple[Fitted, dict[str, Any]]:
-    """Fit one probe on features ``x`` of ``rows.fitted``.
+    """Fit one probe on features ``x`` of ``rows.fitted``: ``PROBES``, and ``curve`` for controls with values.
 
     Returns:
         A function from features [N, D] to class probabilities [N, K] or values [N, T], and what was chosen (C or alpha of
         ``linear``). That of ``linear`` has ``weights()``.
     """
     if isinstance(task, ValueTask):
-        return _fit_values(x, pack, task, rows, kind, seed)
+        values = pack.values(task)[rows.fitted]
+        if kind == "linear":
+            predict, alphas = fit_ridge(x, values, len(rows.val))
+            return predict, {"alpha": alphas}
+        return fit_curve(x, values, len(rows.val)) if kind == "curve" else fit_neighbours(x, values), {}
     labels = pack.labels(task.name)
     y, y_whole, num = labels[rows.train], labels[rows.fitted], len(task.classes)
     if len(np.unique(y)) < 2:
@@ -161,23 +164,7 @@ def fit_probe(
         return fitted, {"C": c}
     if kind == "paper":
         return paper or fit_papers(x, [y_whole], [num], seed)[0], {}
-    if kind == "knn":
-        return fit_knn(x, y_whole, num), {}
-    raise unknown("probe", kind, PROBES)
-
-
-def _fit_values(
-    x: np.ndarray, pack: Pack, task: ValueTask, rows: ProbeSplit, kind: str, seed: int
-) -> tuple[Fitted, dict[str, Any]]:
-    y = pack.values(task)[rows.fitted]
-    if kind == "linear":
-        predict, alphas = fit_ridge(x, y, len(rows.val))
-        return predict, {"alpha": alphas}
-    if kind == "curve":
-        return fit_curve(x, y, len(rows.val)), {}
-    if kind == "knn":
-        return fit_neighbours(x, y), {}
-    raise unknown("probe of values", kind, VALUE_PROBES)
+    return fit_knn(x, y_whole, num), {}
 
 
 def probe_model(

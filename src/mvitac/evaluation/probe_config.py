@@ -39,6 +39,8 @@ class ProbeConfig:
             for value in values:
                 if values.count(value) > 1:
                     raise ValueError(f"{name} {value!r} is given twice: give it once")
+        if not self.probes:
+            raise ValueError("no probe given: choose from linear, paper, knn")
         if self.folds < 0 or self.folds == 1 or (self.folds and self.standardise):
             raise ValueError(f"folds {self.folds}: give 2 or more, without --standardise; or 0 for none")
         if not all(0 < percent <= 100 for percent in self.fractions):

@@ -15,14 +15,13 @@ from sklearn.neighbors import KNeighborsRegressor
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import SplineTransformer
 
-from mvitac.evaluation.classifiers import threadpools
+from mvitac.evaluation.classifiers import NEIGHBOURS, threadpools
 from mvitac.evaluation.diagnostics import BEYOND
 
 Regressor = Callable[[np.ndarray], np.ndarray]
 
 ALPHAS = tuple(10.0**k for k in range(-1, 6))
 """Candidate strengths of ridge regularisation, on standardised features and targets."""
-NEIGHBOURS = 20
 
 
 class Scaler(TransformerMixin, BaseEstimator):

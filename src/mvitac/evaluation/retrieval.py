@@ -45,14 +45,7 @@ def cross_modal(model: Model, pack: Pack, rows: np.ndarray | None = None) -> lis
     for query, gallery in (("vision", "touch"), ("touch", "vision")):
         ranks = diagnostics.retrieval_ranks(z[query], z[gallery], groups)
         hits = np.bincount(groups.numpy(), weights=(ranks < 5).numpy(), minlength=len(sizes)).astype(int)
-        records.append(
-            {
-                "direction": f"{query} -> {gallery}",
-                **diagnostics.recall_at(ranks),
-                "chance R@5": min(1.0, 5 / len(sizes)),
-                "num_groups": len(sizes),
-                "group_sizes": sizes.tolist(),
-                "group_correct": hits.tolist(),
-            }
-        )
+        known = {"direction": f"{query} -> {gallery}", **diagnostics.recall_at(ranks)}
+        known |= {"chance R@5": min(1.0, 5 / len(sizes)), "num_groups": len(sizes)}
+        records.append({**known, "group_sizes": sizes.tolist(), "group_correct": hits.tolist()})
     return records

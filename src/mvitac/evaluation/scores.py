@@ -45,9 +45,8 @@ def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_clas
 def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
     """Pool the records of cross-validation folds, whose test groups differ, into records of all groups.
 
-    Keeps only what every fold has scored. Accuracy, R2 and errors are over all rows.
-    AUROC, F1 and balanced accuracy are means over the
-    folds that have them, since the folds' probes were fitted separately.
+    Keeps only what every fold has scored. Accuracy, R2 and errors are over all rows. AUROC, F1 and balanced accuracy are
+    means over the folds that have them, since the folds' probes were fitted separately.
     """
     keys = ("source", "seed", "task", "modality", "probe")
     found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}

@@ -5,7 +5,7 @@ Shapes: B images in a batch, V views of each image, C channels, H x W pixels, D 
 
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import ClassVar, Self
 
 import numpy as np
@@ -15,8 +15,15 @@ from torch import Tensor, nn
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, keep_modes, trunks
-from mvitac.registry import Registered
+from mvitac.registry import Registered, check_range
 
+RANGES = {
+    **dict.fromkeys(("temperature", "student_temperature", "teacher_temperature"), (1e-6, 1e6)),
+    **dict.fromkeys(("momentum", "bank_momentum", "centre_momentum", "ema"), (0, 1)),
+    **dict.fromkeys(("margin", "lambda_inter", "lambda_sensor", "invariance", "variance", "covariance"), (0, 1e6)),
+    **dict.fromkeys(("out", "hidden"), (1, 65536)),
+}
+"""Fields of methods' configs -> what they may be. A method checks its other numbers in its own ``__post_init__``."""
 Embeddings = dict[Hashable, Tensor]
 """Tensors [B, ...], row i of pair i. Keys are plain tuples of the method's choice, e.g. ``("q", "touch", 0)``."""
 
@@ -161,6 +168,11 @@ class MethodConfig(Registered, ABC):
     label_splits: ClassVar[tuple[str, ...]] = ("train",)
     """Splits whose labels ``Views.labels`` has."""
 
+    def __post_init__(self) -> None:
+        for own in fields(self):
+            if own.name in RANGES:
+                check_range(self, *RANGES[own.name], own.name)
+
     def on_tiny_trunk(self, spec: DataSpec, encoder: Encoders) -> Method:
         """The method on a trunk that is built in no time, to find out whether and how it works on the dataset."""
         trunk = "mvitac_tiny_vit" if self.needs_vit else "mvitac_tiny"
@@ -201,10 +213,7 @@ class MethodConfig(Registered, ABC):
                 raise ValueError(f"{needs}, but {no}: choose of {others}")
 
     def without_idle(self, spec: DataSpec) -> Self:
-        """This config with every setting that has no effect on the dataset at a fixed value.
-
-        Two configs that train alike on the dataset become equal.
-        """
+        """This config with every setting that has no effect on the dataset at a fixed value."""
         return self
 
     @abstractmethod

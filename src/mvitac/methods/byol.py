@@ -16,7 +16,6 @@ from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
 from mvitac.nn.encoders import Encoders, Head, Projected, build_trunk, num_features
 from mvitac.nn.momentum import Momentum, momentum_at
-from mvitac.registry import check_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,10 +31,6 @@ class BYOLConfig(MethodConfig):
     """Width of the embeddings (BYOL: 256)."""
     hidden: Fixed[int] = 1024
     """Hidden width of projector and predictor. Twice the trunk's width, as BYOL's 4096 is twice that of ResNet-50."""
-
-    def __post_init__(self) -> None:
-        check_range(self, 0, 1, "momentum")
-        check_range(self, 1, 65536, "out", "hidden")
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "BYOL":
         return BYOL(self, spec, encoder)

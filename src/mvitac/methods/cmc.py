@@ -54,9 +54,7 @@ class CMCConfig(MethodConfig):
     """Width of the embeddings (TAG: 128)."""
 
     def __post_init__(self) -> None:
-        check_range(self, 1e-6, 1e6, "temperature")
-        check_range(self, 0, 1, "bank_momentum")
-        check_range(self, 1, 65536, "out")
+        super().__post_init__()
         check_range(self, 1, 1 << 20, "num_negatives")
 
     def negatives(self, num_rows: int) -> int:

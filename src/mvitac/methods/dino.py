@@ -26,7 +26,6 @@ from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
 from mvitac.nn.encoders import Encoders, build_towers
 from mvitac.nn.momentum import Momentum, momentum_at
-from mvitac.registry import check_range
 
 BOTTLENECK = 256
 NORM = 0.577
@@ -53,11 +52,6 @@ class DINOConfig(MethodConfig):
     """Number of prototypes K. DINO's 65,536 are 5 % of ImageNet; 4,096 are 5 % of Touch and Go."""
     hidden: Fixed[int] = 2048
     """Hidden width of the 3-layer head (DINO: 2048 for every trunk)."""
-
-    def __post_init__(self) -> None:
-        check_range(self, 1e-6, 1e6, "student_temperature", "teacher_temperature")
-        check_range(self, 0, 1, "centre_momentum", "momentum")
-        check_range(self, 1, 65536, "out", "hidden")
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "DINO":
         return DINO(self, spec, encoder)

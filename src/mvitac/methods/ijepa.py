@@ -62,7 +62,7 @@ class IJEPAConfig(MethodConfig):
     """What a predictor sees. own: the context of its modality. both: also that of the other modality."""
 
     def __post_init__(self) -> None:
-        check_range(self, 0, 1, "ema")
+        super().__post_init__()
         check_range(self, 1, 64, "num_targets")
         if not 0 < self.target_scale[0] <= self.target_scale[1] <= 1:
             raise ValueError(f"target_scale {self.target_scale}: give two rising numbers above 0, at most 1")

@@ -25,7 +25,6 @@ from mvitac.methods.mvitac import PARTS, MViTac, MViTacConfig
 from mvitac.nn.encoders import Encoders
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Queue
-from mvitac.registry import check_range
 
 HEADS = [(modality, head) for modality in ("vision", "touch") for head in ("intra", "inter")]  # each has a queue
 
@@ -43,11 +42,6 @@ class MCTConfig(QueueConfig):
     """Temperature tau of the intra-modal losses."""
     lambda_inter: float = 1.0
     """Weight of the two inter-modal losses."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_range(self, 1e-6, 1e6, "temperature")
-        check_range(self, 0, 1e6, "margin", "lambda_inter")
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "MCT":
         self.check_modalities(spec)

@@ -42,8 +42,7 @@ class QueueConfig(MethodConfig, ABC):
     """BatchNorm after the first layer of the heads (MoCo v2: none)."""
 
     def __post_init__(self) -> None:
-        check_range(self, 0, 1, "momentum")
-        check_range(self, 1, 65536, "out", "hidden")
+        super().__post_init__()
         check_range(self, 1, 1 << 24, "queue")
 
     def queue_size(self, num_rows: int) -> int:
@@ -60,10 +59,6 @@ class MoCoConfig(QueueConfig):
 
     temperature: float = 0.2
     """Temperature tau (MoCo v2: .2)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_range(self, 1e-6, 1e6, "temperature")
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "MoCo":
         return MoCo(self, spec, encoder)

@@ -82,11 +82,8 @@ class MViTacConfig(MethodConfig):
     """BatchNorm after the first layer of the heads, as in MoCo v3 and SimCLR v2. None in the paper."""
 
     def __post_init__(self) -> None:
-        check_range(self, 1e-6, 1e6, "temperature")
-        check_range(self, 0, 1e6, "lambda_inter", "lambda_sensor")
-        check_range(self, 0, 1, "momentum")
+        super().__post_init__()
         check_range(self, 0, 0.99, "dropout")
-        check_range(self, 1, 65536, "out", "hidden")
         if not self.losses or len(set(self.losses)) < len(self.losses):
             raise ValueError(f"losses {self.losses}: give one or more of vv, tt, vt, tv, each once")
         if self.pairs == "all" and not self.both_ways:

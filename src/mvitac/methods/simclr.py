@@ -16,7 +16,6 @@ from tyro.conf import Fixed
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
 from mvitac.nn.encoders import Encoders, Head, build_towers
-from mvitac.registry import check_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,10 +33,6 @@ class SimCLRConfig(MethodConfig):
     """Hidden width of the 2-layer head (SimCLR: the trunk's width)."""
     head_norm: Fixed[bool] = True
     """BatchNorm after the first layer of the head (as in the authors' code)."""
-
-    def __post_init__(self) -> None:
-        check_range(self, 1e-6, 1e6, "temperature")
-        check_range(self, 1, 65536, "out", "hidden")
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "SimCLR":
         return SimCLR(self, spec, encoder)

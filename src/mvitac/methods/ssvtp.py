@@ -19,7 +19,6 @@ from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
 from mvitac.nn.encoders import Encoders, build_towers, heads
 from mvitac.nn.losses import info_nce
-from mvitac.registry import check_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,10 +32,6 @@ class SSVTPConfig(MethodConfig):
     """Temperature tau. Not known for SSVTP; this is MViTac's best."""
     out: Fixed[int] = 128
     """Width of the embeddings (128 in MViTac's comparison, 8 in SSVTP)."""
-
-    def __post_init__(self) -> None:
-        check_range(self, 1e-6, 1e6, "temperature")
-        check_range(self, 1, 65536, "out")
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "SSVTP":
         self.check_modalities(spec)

@@ -22,7 +22,6 @@ from tyro.conf import Fixed
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
 from mvitac.nn.encoders import Encoders, build_towers
-from mvitac.registry import check_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,10 +39,6 @@ class VICRegConfig(MethodConfig):
     """Weight of c (VICReg: 1)."""
     hidden: Fixed[int] = 2048
     """Width of the three expander layers. Four times the trunk's width, as VICReg's 8192 is four times that of ResNet-50."""
-
-    def __post_init__(self) -> None:
-        check_range(self, 0, 1e6, "invariance", "variance", "covariance")
-        check_range(self, 1, 65536, "hidden")
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "VICReg":
         return VICReg(self, spec, encoder)

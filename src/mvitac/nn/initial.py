@@ -1,15 +1,13 @@
-"""Start weights from another model: what to take (``Init``), and loading a trunk or a head from a state dict."""
+"""Start weights from another model: what to take (``Init``). ``training/start.py`` loads them."""
 
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal
 
-from torch import Tensor, nn
 from tyro.conf import Fixed, arg
 
-from mvitac.nn.encoders import PerFrame
-from mvitac.nn.weights import load_weights, misfit, read_safetensors, safetensors_digest
+from mvitac.nn.weights import read_safetensors, safetensors_digest
 from mvitac.shipped import named
 
 MODEL = "model.safetensors"  # the file with the weights in the folder of a run or an artifact
@@ -40,9 +38,8 @@ class Init:
         file = place / MODEL if place.is_dir() else place
         if not file.is_file():
             unfinished = "; its run is not finished, continue it with --resume" * (place / "checkpoint.pt").exists()
-            raise ValueError(
-                f"init {file} does not exist{unfinished}: give a finished run, an artifact or .safetensors"
-            )
+            what = f"init {file} does not exist{unfinished}"
+            raise ValueError(f"{what}: give a finished run, an artifact or .safetensors")
         return file
 
     def resolved(self) -> "Init":
@@ -58,19 +55,3 @@ class Init:
 @cache
 def _digest(file: Path, changed: int) -> str:
     return safetensors_digest(read_safetensors(file)[1])
-
-
-def load_trunk(trunk: nn.Module, state: dict[str, Tensor], file: Path | str = "it") -> None:
-    """Load ``state``, the state dict of a trunk from ``build_trunk`` or timm, into another trunk (``load_weights``).
-
-    ``file`` is where it is from, for messages. A trunk that sees a window's frames one by one, and one that
-    sees a single image, take each other's weights. ValueError if they are different networks; ``trunk`` is then unchanged.
-    """
-    inner = {name.removeprefix("trunk."): value for name, value in state.items() if name.startswith("trunk.")}
-    single = trunk.trunk if isinstance(trunk, PerFrame) else trunk
-    load_weights(single, inner or state, file)
-
-
-def fits(module: nn.Module, state: dict[str, Tensor]) -> bool:
-    """Whether ``state`` has the names and shapes of the module's state dict."""
-    return not misfit(module.state_dict(), state)

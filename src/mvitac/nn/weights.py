@@ -102,9 +102,8 @@ def load_weights(network: nn.Module, tensors: State, file: Path | str) -> None:
     """
     expected, fitting, reasons = network.state_dict(), {}, {}
     for start in _starts(tensors):
-        below = {name.removeprefix(start): value for name, value in tensors.items() if name.startswith(start)}
         for convert in (dict, partial(_converted, network)):
-            state = _prepared(network, convert(below), expected)
+            state = _prepared(network, convert(below(start, tensors)), expected)
             if not (why := misfit(expected, state)):
                 fitting[start] = state
                 break
@@ -121,6 +120,11 @@ def load_weights(network: nn.Module, tensors: State, file: Path | str) -> None:
     if start:
         beside = [name for name in tensors if not name.startswith(start)]
         _say(f"{file}: weights read below {start!r}" + f"; left out: {_some(beside)}" * bool(beside))
+
+
+def below(start: str, tensors: State) -> State:
+    """The tensors whose names begin with ``start``, without it."""
+    return {name.removeprefix(start): value for name, value in tensors.items() if name.startswith(start)}
 
 
 @cache

@@ -138,7 +138,7 @@ def _column(entries: list[dict[str, Any]], key: str) -> tuple[list[float], list[
 
 
 def collapse(study: Study) -> list[Markup]:
-    """What training measured on held-out groups: std, rank, alignment, uniformity, gap, kNN, R@5."""
+    """What training measured on held-out groups: std, rank, alignment, uniformity, gap, linear probe, R@5."""
     drawn = []
     chances = [e["eval"]["chance R@5"] for r in study.runs for e in r.log if "chance R@5" in e.get("eval", {})]
     for title, keys, caption in _panels(study):
@@ -164,7 +164,6 @@ def _panels(study: Study) -> list[tuple[str, dict[str, tuple[str, str]], str]]:
 
     across = {"vision->touch R@5": ("vision → touch", "green"), "touch->vision R@5": ("touch → vision", "purple")}
     probe = "Accuracy, or R2 of values; fitted on training rows, scored on held-out rows, never test."
-    knn = "20 nearest training rows vote; held-out rows, never test."
     return [
         ("std of the features", each("std"), "About 1: spread out; 0: collapsed."),
         ("effective rank", each("rankme"), "RankMe; 1: collapsed, higher is richer."),
@@ -172,7 +171,6 @@ def _panels(study: Study) -> list[tuple[str, dict[str, tuple[str, str]], str]]:
         ("uniformity", each("uniformity"), "0: collapsed; −4: spread over the sphere."),
         ("modality gap", {"modality gap": ("touch to vision", "green")}, "Distance of the two means; 0: mixed."),
         *((f"linear probe, {task.name}", each(f"linear {task.name}"), probe) for task in study.pack.spec.all_tasks),
-        *((f"kNN accuracy, {task.name}", each(f"knn {task.name}"), knn) for task in study.pack.spec.tasks),
         ("retrieval R@5", across, "Own group among the first five, in the space both share."),
     ]
 

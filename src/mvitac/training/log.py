@@ -5,12 +5,13 @@ import json
 import re
 import textwrap
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from statistics import mean
 from typing import Any
 
+from mvitac.data.pack import Pack
 from mvitac.registry import to_json, unknown
 from mvitac.run import Run
 from mvitac.system.files import naming, parse_json, write_atomic
@@ -29,17 +30,8 @@ class Log:
     """
 
     def __init__(
-        self,
-        out: Path,
-        start: int,
-        num_steps: int,
-        batch_size: int,
-        measured: Collection[str] = (),
-        *,
-        quiet: bool,
-        loggers: tuple[Logger, ...],
+        self, out: Path, run: Run, pack: Pack, start: int, num_steps: int, *, quiet: bool, loggers: tuple[Logger, ...]
     ) -> None:
-        """``measured``: the tasks whose scores are R2, not accuracies."""
         self.path = out / "log.jsonl"
         kept = [entry for entry in read_log(out) if entry["step"] <= start] if start else []
         self.first = next((entry["eval"] for entry in kept if entry["step"] == 0 and "eval" in entry), {})
@@ -47,9 +39,9 @@ class Log:
         write_atomic(self.path, lambda file: file.write(text.encode()))
         self.file = self.path.open("a")
         self.loggers, self.start, self.since, self.since_step = loggers, start, time.perf_counter(), start
-        self.num_steps, self.batch_size, self.quiet, self.stack = num_steps, batch_size, quiet, ExitStack()
+        self.num_steps, self.batch_size, self.quiet, self.stack = num_steps, run.batch_size, quiet, ExitStack()
         self.advance_bar: Callable[[int, str], None] = lambda num, text: None
-        self.measured, self.begun = measured, False
+        self.measured, self.begun = {task.name for task in pack.spec.values}, False
         self.loss, self.speed = "", ""  # the latest ones, as text
 
     def __enter__(self) -> "Log":
@@ -103,20 +95,16 @@ class Log:
         self.say(_line([str(step), self.loss, self.speed], cells, f"{gain:+.1f}" if step else "", widths))
 
     def _heads(self, columns: dict[str, list[str]], widths: dict[str, int], values: dict[str, float]) -> None:
-        both = any("both/" in key for keys in columns.values() for key in keys)
-        about = (
-            f"on held-out groups (split val): linear probe{' by touch and vision' * both}; change of the mean in points"
-        )
+        both = " by touch and vision" * any("both/" in key for keys in columns.values() for key in keys)
+        about = f"on held-out groups (split val): linear probe{both}; change of the mean in points"
         if "chance R@5" in values:
             about += f"; R@5 by chance {100 * values['chance R@5']:.1f}"
         if left := len(columns) - len(widths):
             about += f"; {left} more in log.jsonl"
         self.say(textwrap.fill(about, WIDTH))
-        units = {name: "R2 %" if name.rpartition(" ")[2] in self.measured else "acc %" for name in widths} | {
-            RETRIEVED: "%"
-        }
+        kinds = dict.fromkeys(self.measured, "R2 %") | {RETRIEVED: "%"}
         self.say(_line(["step", "loss", "pairs/s"], list(widths), "change", widths))
-        self.say(_line([""] * 3, [units[name] for name in widths], "", widths))
+        self.say(_line([""] * 3, [kinds.get(name.rpartition(" ")[2], "acc %") for name in widths], "", widths))
 
     def say(self, text: str) -> None:
         """Print ``text`` on a line above the progress bar."""
@@ -186,7 +174,6 @@ def seconds_of(entries: Iterable[dict[str, Any]], batch_size: int) -> float:
 
 
 LOGGERS = ("tensorboard", "wandb", "trackio")
-Started = tuple[Logger, Callable[[], object]]  # a logger and the function that closes it
 
 
 @contextmanager
@@ -201,32 +188,23 @@ def open_loggers(name: str | None, out: Path, run: Run) -> Iterator[tuple[Logger
         library = importlib.import_module("torch.utils.tensorboard" if name == "tensorboard" else name)
     except ImportError:
         raise ValueError(f"--logger {name} needs its library: pip install -e '.[{name}]' in mvitac's clone") from None
-    # Start it with the first values: a run that is refused must leave no files, since --out must be new.
-    started: list[Started] = []
+    started: list[Any] = []
 
     def send(step: int, values: dict[str, float]) -> None:
-        if not started:
-            started.append(_tensorboard(library, out) if name == "tensorboard" else _tracker(library, out, run))
-        started[0][0](step, values)
+        if not started:  # only now: a run that is refused must leave no files, since --out must be new
+            started.append(
+                library.SummaryWriter(str(out / "tensorboard"))
+                if name == "tensorboard"
+                else library.init(project="mvitac", name=out.name, config=to_json(run))
+            )
+        if name == "tensorboard":
+            for key, value in values.items():
+                started[0].add_scalar(key, value, step)
+        else:  # wandb and trackio have the same functions
+            library.log(values, step=step)
 
     try:
         yield (send,)
     finally:
-        for _, close in started:
-            close()
-
-
-def _tensorboard(library: Any, out: Path) -> Started:
-    writer = library.SummaryWriter(str(out / "tensorboard"))
-
-    def send(step: int, values: dict[str, float]) -> None:
-        for key, value in values.items():
-            writer.add_scalar(key, value, step)
-
-    return send, writer.close
-
-
-def _tracker(library: Any, out: Path, run: Run) -> Started:
-    """wandb or trackio, which have the same functions."""
-    library.init(project="mvitac", name=out.name, config=to_json(run))
-    return lambda step, values: library.log(values, step=step), library.finish
+        for writer in started:
+            writer.close() if name == "tensorboard" else library.finish()

@@ -94,8 +94,7 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
     batches = setup.views.each(Batches(run, pack, setup.rows), start, num_steps)
 
     # Only rank 0 logs and evaluates; on the other processes ``log`` is None.
-    measured = {task.name for task in pack.spec.values}
-    made = Log(out, start, num_steps, run.batch_size, measured, quiet=quiet, loggers=loggers) if world.writes else None
+    made = Log(out, run, pack, start, num_steps, quiet=quiet, loggers=loggers) if world.writes else None
     with made or nullcontext() as log, _stop_signals() as stop_requested:
         if log and not quiet:
             log.say(setup.hardware.sentence)

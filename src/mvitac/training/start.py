@@ -1,22 +1,23 @@
 """Start weights from another model (``Run.init``): read them, load what fits, and say what that model learned from."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch import Tensor
+from torch import nn
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import MODALITIES
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, file_source, read_sources, unknown_source, weights_files
 from mvitac.methods.base import Method
 from mvitac.model import load
-from mvitac.nn.initial import Init, fits, load_trunk
+from mvitac.nn.encoders import PerFrame
+from mvitac.nn.initial import Init
 from mvitac.nn.momentum import Momentum
-from mvitac.nn.weights import FORMAT, read_safetensors
+from mvitac.nn.weights import FORMAT, State, below, load_weights, misfit, read_safetensors
 from mvitac.run import Run
 
-State = dict[str, Tensor]
 ANY = "any"  # key of a trunk's weights in a file that does not say which modality they are for
 
 
@@ -47,14 +48,19 @@ def read_start(init: Init) -> Start | None:
         learned = [unknown_source(folder.name if own else init.file.name)] if found is None else found
         return Start(init, trunks, heads, model.run.encoder.named(model.encoders), learned, model.spec.sensors)
     trunks, heads = (
-        {m: found for m in MODALITIES if (found := _below(f"{kind}.{m}.", tensors))}
+        {m: found for m in MODALITIES if (found := below(f"{kind}.{m}.", tensors))}
         for kind in ("encoders", "projectors")
     )
     return Start(init, trunks or {ANY: tensors}, heads, "", [file_source(init.file)])
 
 
-def _below(prefix: str, tensors: State) -> State:
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+def load_trunk(trunk: nn.Module, state: State, file: Path | str = "it") -> None:
+    """Load ``state``, the state dict of a trunk from ``build_trunk`` or timm, into another trunk (``load_weights``).
+
+    A trunk that sees a window's frames one by one, and one that sees a single image, take each other's weights.
+    ValueError, which names ``file``, if they are different networks; ``trunk`` is then unchanged.
+    """
+    load_weights(trunk.trunk if isinstance(trunk, PerFrame) else trunk, below("trunk.", state) or state, file)
 
 
 def load_start(start: Start, method: Method) -> dict[str, Any]:
@@ -75,7 +81,7 @@ def load_start(start: Start, method: Method) -> dict[str, Any]:
             reasons[modality] = f"its trunk is {start.trunk}, {error}" if start.trunk and state else str(error)
             continue
         taken[modality] = ["trunk"]
-        if init.heads and modality in heads and fits(heads[modality], start.heads.get(modality, {})):
+        if init.heads and modality in heads and not misfit(heads[modality].state_dict(), start.heads.get(modality, {})):
             heads[modality].load_state_dict(start.heads[modality])
             taken[modality].append("head")
     if reasons and (init.modalities or not taken):

@@ -1,7 +1,7 @@
 """Evaluation during training on held-out groups (split val, never test): what the features are worth, from step 0 on.
 
-A linear probe, kNN accuracy, retrieval and signs of collapse. The start (step 0) is the baseline. The best weights are
-those with the lowest errors of the linear probe (``diagnostics.mean_error``).
+A linear probe, retrieval and signs of collapse. The start (step 0) is the baseline. The best weights are those with the
+lowest errors of the linear probe (``diagnostics.mean_error``).
 """
 
 import math
@@ -53,15 +53,11 @@ class Validation:
             if self.run.eval_every:
                 model.save(self.out / BEST)
                 self.method.train()
-        self.log.evaluation(step, values, self._verdict(cells) if last else "")
-
-    def _verdict(self, cells: Cells) -> str:
-        start = self.kept["start"]
-        text = verdict(start, cells, self.pack.spec.group_by)
-        if self.run.eval_every and cells:
-            change = 100 * (self.kept["best"] / _error(start) - 1)
-            text += f"; best at step {self.kept['best_step']} (errors {change:+.0f} % in the mean over tasks, {BEST})"
-        return text
+        said = verdict(self.kept["start"], cells, self.pack.spec.group_by) if last else ""
+        if last and self.run.eval_every and cells:
+            change = 100 * (self.kept["best"] / _error(self.kept["start"]) - 1)
+            said += f"; best at step {self.kept['best_step']} (errors {change:+.0f} % in the mean over tasks, {BEST})"
+        self.log.evaluation(step, values, said)
 
 
 def validate(
@@ -70,8 +66,8 @@ def validate(
     """Scores on held-out groups (split val, never test), and the linear probes' errors by group, to compare evaluations.
 
     Only rows with both modalities are used. Without rows of val that are not trained on, the scores are computed on
-    training rows, and there are no probes. Scores are by name, e.g. "touch/linear category", "touch/knn category",
-    "vision/rankme", "vision->touch R@5"; of a mix, those of each part, named "<part> <name>".
+    training rows, and there are no probes. Scores are by name, e.g. "touch/linear category", "vision/rankme",
+    "vision->touch R@5"; of a mix, those of each part, named "<part> <name>".
 
     ``locked``: modality -> features [pack.num, D] that are known already.
     """
@@ -106,9 +102,7 @@ def _validate(model: Model, pack: Pack, run: Run, locked: Mapping[str, Tensor]) 
         values[f"{modality}/std"] = diagnostics.spread(features)
         values[f"{modality}/rankme"] = diagnostics.rank_me(features)
     if held_out:
-        bank = {m: read(m, train_rows) for m in z}
-        values |= _knn(pack, train_rows, rows, bank, z)
-        cells = _linear(pack, train_rows, rows, _with_both(bank), _with_both(z))
+        cells = _linear(pack, train_rows, rows, {m: read(m, train_rows) for m in z}, z)
         values |= {name: float(_scores(cell).mean()) for name, cell in cells.items()}
     if len(model.projectors) == len(z) == 2:
         values |= _shared_space(model, pack, run, rows, z)
@@ -119,31 +113,15 @@ def _sample(rows: np.ndarray, num: int, rng: np.random.Generator) -> np.ndarray:
     return np.sort(rng.choice(rows, min(num, len(rows)), replace=False))
 
 
-def _knn(
-    pack: Pack, train_rows: np.ndarray, rows: np.ndarray, bank: dict[str, Tensor], z: dict[str, Tensor]
-) -> dict[str, float]:
-    """kNN accuracy of each task on ``rows``, whose features are ``z``; neighbours are ``train_rows``, with ``bank``."""
-    values = {}
-    for task in pack.spec.tasks:
-        known = torch.from_numpy(pack.labels(task.name, "train"))[train_rows]
-        asked = torch.from_numpy(pack.labels(task.name, "val"))[rows]
-        labelled, scored = known >= 0, asked >= 0
-        if labelled.any() and scored.any():
-            for m in z:
-                sides = bank[m][labelled], known[labelled], z[m][scored], asked[scored]
-                values[f"{m}/knn {task.name}"] = diagnostics.knn_accuracy(*sides)
-    return values
-
-
-def _with_both(z: dict[str, Tensor]) -> dict[str, Tensor]:
-    """``z``, and the features of two modalities side by side as "both"."""
-    return z | {"both": torch.cat(list(z.values()), dim=1)} if len(z) > 1 else z
-
-
 def _linear(
     pack: Pack, train_rows: np.ndarray, rows: np.ndarray, bank: dict[str, Tensor], z: dict[str, Tensor]
 ) -> Cells:
-    """Errors by group of a linear probe of each task and modality, and of both together, as for ``_knn``."""
+    """Errors by group on ``rows``, with features ``z``, of a linear probe of each task and modality, and of both together.
+
+    It is fitted on ``train_rows``, with features ``bank``.
+    """
+    if len(z) > 1:
+        bank, z = (found | {"both": torch.cat(list(found.values()), dim=1)} for found in (bank, z))
     names = np.unique(pack.column("group").astype(str), return_inverse=True)[1]
     groups = torch.from_numpy(names[train_rows])
     by_group = torch.from_numpy(np.unique(names[rows], return_inverse=True)[1])
@@ -188,11 +166,6 @@ def _errors(guess: Tensor, true: Tensor) -> Tensor:
     return torch.cat([guess - true, true.mean() - true], dim=1).double().square()
 
 
-def _groups(cell: Tensor) -> Tensor:
-    """bool [groups]: those with rows in every target."""
-    return (cell[..., 1] > 0).all(0)
-
-
 def _scores(cell: Tensor) -> Tensor:
     """[targets]: accuracy or R2."""
     errors, guess = cell.sum(1).unbind(-1)
@@ -212,7 +185,7 @@ def verdict(start: Cells, end: Cells, by: str) -> str:
     few = f"cannot tell with under {MIN_GROUPS} {by}s"
     said: dict[str, list[str]] = {word: [] for word in ("rose", "fell", "neither", few)}
     for name in sorted(start.keys() & end.keys()):
-        keep = _groups(end[name])
+        keep = (end[name][..., 1] > 0).all(0)  # groups with rows in every target
         if start[name].shape != end[name].shape or not (num := int(keep.sum())):
             continue
         points, margin = _change(start[name][:, keep], end[name][:, keep])
