@@ -200,7 +200,7 @@ ARTIFACTS: dict[str, tuple[dict[str, Any], str]] = {
     "probe of sound": ({"about": put("probes", 0, "modality", value="sound")}, "is damaged"),
     "wide probe": ({"probes": {WEIGHT: torch.zeros(3, 9)}}, "reads 9 features"),
     "short bias": ({"probes": {BIAS: torch.zeros(2)}}, "do not fit 3 outputs"),
-    "no numbers": ({"probes": {WEIGHT: torch.full((3, 64), torch.nan)}}, "not all finite"),
+    "no numbers": ({"probes": {WEIGHT: torch.full((3, 64), torch.nan)}}, "not all finite float32"),
 }
 EXPORTS: dict[str, tuple[dict[str, Any], str]] = {
     name: ({"about": change}, says)

@@ -23,7 +23,7 @@ from mvitac.data.source import Sample
 from mvitac.data.spec import DataSpec
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation import features as features_module
-from mvitac.evaluation.classifiers import fit_knn, fit_linear, fit_papers, train_heads
+from mvitac.evaluation.classifiers import fit_knn, fit_linear, fit_papers
 from mvitac.evaluation.controls import borders, controls_of, frozen_trunks, imagenet_trunk, starts_of, thumbnails
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.few_labels import few
@@ -44,7 +44,6 @@ from mvitac.system.device import Hardware
 from mvitac.system.files import read_json
 from mvitac.training import setup
 from mvitac.training.loop import train
-from mvitac.transforms.random_views import ViewAugment
 from support.toy import Toy, toy_pack
 
 
@@ -226,16 +225,13 @@ def test_retrieval_of_the_untrained_is_chance(pack: Pack) -> None:
 
 def test_retrieval_needs_enough_groups_to_choose_from(result: dict, tmp_path: Path) -> None:
     assert len(result["retrieval"]) == 2 * len({(r["source"], r["seed"]) for r in result["retrieval"]})
-    few = toy_pack(tmp_path / "few", num=60)
-    run = recipe("smoke", PackConfig(path=few.path))
-    assert len(set(few.column("group")[few.rows("test")])) < 10
-    assert cross_modal(fresh(run, few.spec, few.size), few) == []
     ten = toy_pack(tmp_path / "ten")
     test, groups = ten.rows("test"), ten.column("group").astype(str)
     names = np.unique(groups[test])
     groups[np.isin(groups, names[10:])] = names[0]
     ten.table = ten.table.set_column(ten.table.schema.get_field_index("group"), "group", pa.array(groups))
     assert len(set(groups[test])) == 10  # the best five of ten are half of them
+    run = recipe("smoke", PackConfig(path=ten.path))
     assert cross_modal(fresh(run, ten.spec, ten.size), ten) == []
 
 
@@ -317,19 +313,6 @@ def test_seeds_whose_automatic_precision_differs_are_seeds_of_one_run(pack: Pack
             paths.append(train(replace(run, seed=seed), tmp_path / f"s{seed}", quiet=True))
     models = [load(path) for path in paths]
     assert [m.run.precision for m in models] == ["fp32", "bf16"] and names_of(paths, models) == ["mvitac", "mvitac"]
-
-
-def test_heads_trained_together_are_the_heads_trained_alone() -> None:
-    """Three tasks at once: the weights of each trained by itself."""
-    rng = np.random.default_rng(0)
-    features = torch.from_numpy(rng.normal(size=(600, 12)).astype(np.float32))
-    classes = [3, 2, 4]
-    labels = torch.from_numpy(np.stack([rng.integers(0, k, 600) for k in classes]))
-    together, other = (train_heads(features, labels, classes, seed) for seed in (5, 6))
-    for task, num in enumerate(classes):
-        (single,) = train_heads(features, labels[task : task + 1], [num], 5)
-        torch.testing.assert_close(together[task], single, atol=1e-5, rtol=1e-4)
-    assert not torch.allclose(together[0], other[0], atol=1e-2)
 
 
 def test_tasks_of_one_run_are_probed_together(pack: Pack) -> None:
@@ -418,19 +401,6 @@ def test_frozen_trunks_are_imagenet_and_files_that_runs_started_from() -> None:
     (_, control), *rest = frozen_trunks([run])
     assert not rest and {control.encoder[m].trunk for m in ("vision", "touch")} == {"tf_efficientnet_lite0"}
     assert {control.augment.whole_of(m) for m in ("vision", "touch")} == {128}
-
-
-def test_the_features_of_a_locked_tower_are_kept_once_for_the_run_and_its_control() -> None:
-    base = recipe("smoke")
-    locked = EncoderConfig(trunk="tf_efficientnet_lite0", locked=True)
-    fixed = ViewAugment(scale=(1.0, 1.0), flip=0.0, grayscale=0.0, size=128)
-    run = replace(
-        base, encoder=replace(base.encoder, vision=locked), augment=replace(base.augment, size=32, vision=fixed)
-    )
-    spec = Toy(4).spec()
-    model, control = (fresh(each, spec, 40) for each in (run, frozen_trunks([run])[0][1]))
-    keys = {m: {each.features_key(m) for each in (model, control)} for m in ("vision", "touch")}
-    assert len(keys["vision"]) == 1 and len(keys["touch"]) == 2
 
 
 def test_the_runs_own_trunk_is_the_imagenet_control_where_its_weights_are(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -102,8 +102,7 @@ def test_encoders_and_projectors_fit(name: str) -> None:
 def test_one_modality_works_or_is_refused(name: str) -> None:
     spec = Toy(vision_channels=0).spec()
     if name in PAIRED:
-        others = ", ".join(sorted(set(NAMES) - set(PAIRED)))  # by name, from what is registered
-        with pytest.raises(ValueError, match=f"'{name}' learns from pairs.*'toy' has touch only.*{others}"):
+        with pytest.raises(ValueError, match=f"'{name}' learns from pairs.*'toy' has touch only"):
             build(name, spec)
         return
     method = build(name, spec)

@@ -14,8 +14,7 @@ from mvitac.data.spec import DataSpec, Window
 from mvitac.methods.base import Method, Views
 from mvitac.methods.ijepa import IJEPA, Blocks, IJEPAConfig, multi_block
 from mvitac.methods.mae import MAE, MAEConfig, split_patches
-from mvitac.nn.encoders import PerFrame
-from mvitac.nn.positions import sin_cos_positions
+from mvitac.nn.encoders import PerFrame, sin_cos_positions
 from mvitac.nn.vit import Predictor, row_uniform
 from mvitac.recipes import recipe
 from mvitac.training.sampler import Batches

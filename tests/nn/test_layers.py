@@ -1,6 +1,7 @@
 """Losses, convolutions and ViTs against closed forms, plain torch and timm."""
 
 import copy
+from unittest.mock import patch
 
 import pytest
 import timm
@@ -10,9 +11,8 @@ from timm.layers.conv2d_same import Conv2dSame
 from timm.models.vision_transformer import VisionTransformer
 from torch import nn
 
-from mvitac.nn.encoders import SCRATCH, EncoderConfig, build_trunk
+from mvitac.nn.encoders import SCRATCH, EncoderConfig, build_trunk, sin_cos_positions
 from mvitac.nn.losses import info_nce
-from mvitac.nn.positions import sin_cos_positions
 from mvitac.nn.small_conv import SmallMapConv2d, _Product, use_convolutions, use_products
 from mvitac.nn.vit import encode_visible, patches, row_uniform
 from support.small_methods import slow_info_nce
@@ -98,28 +98,19 @@ def test_bf16_autocast_is_as_close_as_the_convolution() -> None:
     torch.testing.assert_close(got.float(), want, atol=0.02, rtol=0.02)
 
 
-def products(trunk: nn.Module, images: torch.Tensor, monkeypatch: pytest.MonkeyPatch) -> int:
-    count = 0
-    original = _Product.apply
-
-    def counted(*arguments: object) -> object:
-        nonlocal count
-        count += 1
-        return original(*arguments)
-
-    monkeypatch.setattr(_Product, "apply", counted)
-    trunk(images)
-    monkeypatch.setattr(_Product, "apply", original)
-    return count
+def products(trunk: nn.Module, images: torch.Tensor) -> int:
+    with patch.object(_Product, "apply", side_effect=_Product.apply) as counted:
+        trunk(images)
+    return counted.call_count
 
 
-def test_only_small_maps_in_training_take_the_product(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_small_maps_in_training_take_the_product() -> None:
     trunk = build_trunk(EncoderConfig(trunk="resnet10t", weights=SCRATCH), 3)
     images = torch.randn(2, 3, 48, 48)
     # Stages 3 (3x3 pixels) and 4 (2x2) have two 3x3 convolutions each; larger maps stay with the convolution.
-    assert products(trunk.train(), images, monkeypatch) == 4
-    assert products(trunk.train(), torch.randn(2, 3, 160, 160), monkeypatch) == 0
-    assert products(trunk.eval(), images, monkeypatch) == 0
+    assert products(trunk.train(), images) == 4
+    assert products(trunk.train(), torch.randn(2, 3, 160, 160)) == 0
+    assert products(trunk.eval(), images) == 0
 
 
 def test_other_convolutions_stay_as_they_are() -> None:

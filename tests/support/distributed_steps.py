@@ -1,6 +1,6 @@
 """What one process and each of two do alike: three steps, the third resumed, and the whole loop.
 
-A process of test_distributed.py does ``main("step", DIR)`` or ``main("train", DATA, OUT, DIE_AFTER, METHOD)``.
+A process of test_distributed.py does ``main("step", DIR)`` or ``main("train", PACK, OUT, DIE_AFTER)``.
 """
 
 from collections.abc import Callable
@@ -14,15 +14,13 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from mvitac.datasets.base import DatasetConfig
-from mvitac.datasets.mix import MixConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.methods.base import Method, MethodConfig
 from mvitac.methods.cmc import CMCConfig
 from mvitac.methods.ijepa import IJEPAConfig
 from mvitac.methods.mae import MAEConfig
 from mvitac.methods.mvitac import MViTacConfig
-from mvitac.recipes import recipe, with_method
+from mvitac.recipes import recipe
 from mvitac.run import Optim, Run
 from mvitac.system.distributed import World, join
 from mvitac.training import checkpoint
@@ -65,10 +63,6 @@ def build(method: str = "mvitac") -> Method:
     return built
 
 
-def loop_run(data: DatasetConfig, method: str) -> Run:
-    return replace(with_method(recipe("smoke", data), method), steps=4, checkpoint_every=2, log_every=1)
-
-
 def three_steps(
     start: Callable[[], tuple[Method, Step]], parts: list[Chunk], run: Run, to: Path, world: World | None = None
 ) -> dict[str, Any]:
@@ -107,13 +101,11 @@ def step(folder: Path) -> None:
         torch.save({**made, "resumed": resumed}, here / f"rank{world.rank}.pt")
 
 
-def train(place: str, out: Path, die_after: int, name: str) -> None:
+def train(place: str, out: Path, die_after: int) -> None:
     """The whole loop; every process dies after its ``die_after``-th batch, and notes the rows it saw.
 
-    ``place`` is a pack, or the parts of a mix with batches of one part.
+    ``place`` is a pack.
     """
-    mixed = "=" in place
-    data = MixConfig(parts=tuple(place.split()), batches="one-part") if mixed else PackConfig(path=Path(place))
     real, seen = StepViews.make, []
 
     def watched(self: StepViews, rows: np.ndarray, seed: int) -> object:
@@ -123,10 +115,11 @@ def train(place: str, out: Path, die_after: int, name: str) -> None:
         return real(self, rows, seed)
 
     StepViews.make = watched  # type: ignore[assignment]
-    pretrain(loop_run(data, name), out, resume=True, quiet=True)
+    run = replace(recipe("smoke", PackConfig(path=Path(place))), steps=4, checkpoint_every=2, log_every=1)
+    pretrain(run, out, resume=True, quiet=True)
     torch.save(seen, out.with_name(f"{out.name}-rows{join().rank}.pt"))
 
 
 def main(kind: str, *given: str) -> None:
-    step(Path(given[0])) if kind == "step" else train(given[0], Path(given[1]), int(given[2]), given[3])
+    step(Path(given[0])) if kind == "step" else train(given[0], Path(given[1]), int(given[2]))
     dist.destroy_process_group()

@@ -15,7 +15,6 @@ import mvitac
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
-from mvitac.deploy.engine import open_model
 from mvitac.deploy.export import ExportConfig, export
 from mvitac.evaluation.evaluate import ProbeConfig
 from mvitac.experiments.collect import gather, lay_out, outline
@@ -175,27 +174,6 @@ def test_a_bf16_export_needs_a_cpu_that_can_check_it(
     with pytest.raises(ValueError, match="--precision bf16: this CPU does not compute bf16 itself"):
         export(mvitac.load(smoke_run), pack, tmp_path / "e", ExportConfig(precision="bf16"))
     assert not (tmp_path / "e").exists()
-
-
-def test_a_bf16_export_runs_in_fp32_where_openvino_lists_no_bf16(onnx: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import openvino
-
-    hints: list[str] = []
-    listed = ["FP32"]
-
-    class Core:
-        def get_property(self, *names: str) -> list[str]:
-            return listed
-
-        def compile_model(self, path: Path, device: str, config: dict[str, str]) -> SimpleNamespace:
-            hints.append(config["INFERENCE_PRECISION_HINT"])
-            return SimpleNamespace(inputs=[], create_infer_request=lambda: None)
-
-    monkeypatch.setattr(openvino, "Core", Core)
-    for capabilities in (["FP32"], ["BF16", "FP32"]):
-        listed = capabilities
-        open_model(onnx / "model.onnx", "openvino", "bf16")
-    assert hints == ["f32", "bf16"]
 
 
 # -- a CPU without bf16 -----------------------------------------------------------------------------------------------

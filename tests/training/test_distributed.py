@@ -6,26 +6,20 @@ from functools import partial
 from itertools import chain
 from pathlib import Path
 
-import numpy as np
 import pytest
 import safetensors.torch
 import timm
 import torch
 
 from mvitac.data.pack import Pack
-from mvitac.datasets.mix import MixConfig
-from mvitac.datasets.pack import PackConfig
 from mvitac.methods.base import Method
 from mvitac.recipes import recipe
 from mvitac.system.distributed import World
-from mvitac.training.loop import train
 from mvitac.training.setup import check_divisible
 from mvitac.training.step import Step
-from support.distributed_steps import METHODS, build, loop_run, main, run_of, third_step, three_steps
-from support.mixes import Gel, built
+from support.distributed_steps import METHODS, build, main, run_of, third_step, three_steps
 from support.processes import begin
 from support.small_steps import assert_close, views
-from support.training_runs import batches
 
 
 def together(folder: Path, *words: str, num: int = 2, fails: bool = False) -> None:
@@ -81,10 +75,10 @@ def test_two_processes_equal_one_on_the_joint_batch(pair: Path, method: str) -> 
 @pytest.mark.slow
 def test_the_loop_shares_rows_writes_once_and_resumes_bit_for_bit(pack: Pack, tmp_path: Path) -> None:
     straight, cut = tmp_path / "straight", tmp_path / "cut"
-    together(tmp_path, "train", str(pack.path), str(straight), "99", "mvitac")
-    together(tmp_path, "train", str(pack.path), str(cut), "3", "mvitac", fails=True)
+    together(tmp_path, "train", str(pack.path), str(straight), "99")
+    together(tmp_path, "train", str(pack.path), str(cut), "3", fails=True)
     assert not (cut / "model.safetensors").exists()
-    together(tmp_path, "train", str(pack.path), str(cut), "99", "mvitac")
+    together(tmp_path, "train", str(pack.path), str(cut), "99")
     a, b = (safetensors.torch.load_file(path / "model.safetensors") for path in (straight, cut))
     assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
     for path in (straight, cut):
@@ -93,42 +87,6 @@ def test_the_loop_shares_rows_writes_once_and_resumes_bit_for_bit(pack: Pack, tm
     first, second = (torch.load(tmp_path / f"straight-rows{r}.pt") for r in (0, 1))
     epoch = [[*chain(*rows)] for rows in (first[:3], second[:3])]  # 60 training rows: three batches of 16 per epoch
     assert len(set(epoch[0])) == len(set(epoch[1])) == 24 and not set(epoch[0]) & set(epoch[1])
-
-
-@pytest.mark.slow
-def test_a_mix_with_parts_that_lack_a_camera_is_shared_part_by_part(pack: Pack, tmp_path: Path) -> None:
-    built(Gel(num=60), tmp_path / "gel", size=24)
-    parts = f"toy={pack.path}:1 gel={tmp_path / 'gel'}:3"
-    together(tmp_path, "train", parts, str(tmp_path / "run"), "99", "mvitac")
-    run = loop_run(MixConfig(parts=tuple(parts.split()), batches="one-part"), "mvitac")
-    mix = run.data.open()
-    expected = list(batches(run, mix, run.method.training_rows(mix), 0, 4))
-    seen = [torch.load(tmp_path / f"run-rows{rank}.pt") for rank in (0, 1)]
-    assert [first + second for first, second in zip(*seen, strict=True)] == [rows.tolist() for rows in expected]
-    assert sorted({tuple(set(rows < pack.num)) for rows in expected}) == [(False,), (True,)]
-
-
-@pytest.mark.slow
-def test_the_loop_keeps_banks_when_the_number_of_processes_changes(pack: Pack, tmp_path: Path) -> None:
-    """Two are cut after step 3 of 4, one goes on from step 2: in the end the rows seen by either have moved, to unit
-    length, and the others are where they were at the start."""
-    out, run = tmp_path / "run", loop_run(PackConfig(path=pack.path), "cmc")
-    together(tmp_path, "train", str(pack.path), str(out), "3", "cmc", fails=True)
-    assert torch.load(out / "checkpoint.pt")["step"] == 2
-    train(run, out, resume=True, quiet=True)
-    rows = run.method.training_rows(pack)
-    seen = np.isin(rows, np.concatenate(list(batches(run, pack, rows, 0, 4))))
-    assert 0 < seen.sum() < len(rows)
-    torch.manual_seed(run.seed)
-    start = run.method.build(pack.spec, run.encoder)
-    start.prepare(torch.from_numpy(rows))
-    state = torch.load(out / "checkpoint.pt")
-    assert state["step"] == 4 and (state["method"]["z_norm"] > 0).all()
-    for name, before in start.state_dict().items():
-        if name.startswith("banks."):
-            bank = state["method"][name]
-            assert torch.equal(bank[~seen], before[~seen]) and not torch.isclose(bank[seen], before[seen]).all(1).any()
-            torch.testing.assert_close(bank[seen].norm(dim=1), torch.ones(int(seen.sum())))
 
 
 def test_batchnorm_over_gpus_keeps_the_activation_that_timm_puts_into_it() -> None:

@@ -11,6 +11,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from mvitac import __version__
+from mvitac.registry import unknown
 from mvitac.shipped import with_names
 
 HELP = (Path(__file__).parent / "help.txt").read_text(encoding="utf-8")
@@ -78,24 +80,17 @@ def _continued(arguments: list[str]) -> str:
 
 
 def _run(arguments: list[str]) -> int:
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
+    asked = arguments[1:2] if arguments[:1] == ["data"] else arguments[:1]
+    if asked in ([], ["-h"], ["--help"], ["help"]):
         print(HELP, end="")
         return 0
-    if arguments[0] == "data" and (len(arguments) == 1 or arguments[1] in ("-h", "--help")):
-        lines = [line for line in HELP.splitlines() if line.startswith("  data ")]
-        print("usage: mvitac data COMMAND [OPTIONS]     (--help after a command explains it)", "", *lines, sep="\n")
-        return 0
     if arguments[0] == "--version":
-        from mvitac import __version__
-
         print(__version__)
         return 0
     name, rest = arguments[0], arguments[1:]
     if name == "data" or (rest and f"{name} {rest[0]}" in COMMANDS):
         name, rest = f"{name} {rest[0]}", rest[1:]
     if name not in COMMANDS:
-        from mvitac.registry import unknown
-
         raise unknown("command", name, COMMANDS)
     text = help_file(name)
     if rest in (["--help"], ["-h"]) and text.exists():
@@ -120,8 +115,6 @@ def _check_choices(rest: Sequence[str], text: Path) -> None:
         option, choices = known[1], known[2].split("|")
         value = next(iter(rest[rest.index(option) + 1 :]), choices[0])
         if value not in choices and not Path(value).exists():
-            from mvitac.registry import unknown
-
             raise unknown({"--data": "dataset"}.get(option, option[2:]), value, choices)
 
 

@@ -43,10 +43,6 @@ def _settings(path: Path, model: Model) -> str:
 
 
 def _places(groups: Sequence[Sequence[Path]]) -> list[str]:
-    """Shortest distinct names of groups of folders: from the folder that a group shares, else from all of its folders."""
-    whole = [[path.resolve() for path in group] for group in groups]
-    shared = [Path(os.path.commonpath(group)) for group in whole]
-    listed = [[place] for place in shared] if len(set(shared)) == len(groups) else whole
-    every = [place for group in listed for place in group]
-    num = next(n for n in range(1, 1000) if len({place.parts[-n:] for place in every}) == len(every))
-    return [", ".join("/".join(place.parts[-num:]) for place in group) for group in listed]
+    """Distinct names of groups of folders: that of the folder which a group shares, else all of its folders."""
+    shared = [Path(os.path.commonpath([path.resolve() for path in group])).name for group in groups]
+    return shared if len(set(shared)) == len(groups) else [", ".join(map(str, group)) for group in groups]

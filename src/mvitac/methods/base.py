@@ -185,9 +185,8 @@ class MethodConfig(Registered, ABC):
     def check_modalities(self, spec: DataSpec) -> None:
         """Raise ValueError if the method ``needs_pairs`` and the dataset lacks a modality."""
         if self.needs_pairs and len(spec.modalities) < 2:
-            others = ", ".join(sorted(name for name, config in self.choices.items() if not config.needs_pairs))  # type: ignore
             only = f"dataset {spec.name!r} has {', '.join(spec.modalities)} only"
-            raise ValueError(f"method {self.name!r} learns from pairs, but {only}: choose of {others}")
+            raise ValueError(f"method {self.name!r} learns from pairs, but {only}: choose another --method")
 
     @property
     def sensor_view(self) -> bool:
@@ -208,9 +207,8 @@ class MethodConfig(Registered, ABC):
             lacking = rows[~pack.has(modality)[rows]]
             if len(lacking):
                 no = f"{len(lacking)} rows of part {', '.join(np.unique(pack.column('part')[lacking]))} have no {modality}"
-                others = ", ".join(sorted(name for name, kind in self.choices.items() if kind.takes_missing))  # type: ignore
                 needs = f"method {self.name!r} needs {' and '.join(modalities)} of every row"
-                raise ValueError(f"{needs}, but {no}: choose of {others}")
+                raise ValueError(f"{needs}, but {no}: choose another --method")
 
     def without_idle(self, spec: DataSpec) -> Self:
         """This config with every setting that has no effect on the dataset at a fixed value."""

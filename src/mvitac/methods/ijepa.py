@@ -152,8 +152,7 @@ class IJEPA(Contrastive):
         self.predictors = nn.ModuleDict()
         for modality, trunk in self.trunks.items():
             width = vit.vit_of(trunk).embed_dim
-            other = vit.other_trunk(self.trunks, modality, config.senses)
-            self.predictors[modality] = vit.Predictor(trunk, width, other, 1 / 2, (384, 12))
+            self.predictors[modality] = vit.Predictor(self.trunks, modality, width, config.senses, 1 / 2, (384, 12))
 
     def blocks(self, batch: Views, modality: str) -> Blocks:
         """The blocks of each image that the ViT of ``modality`` sees."""

@@ -85,8 +85,7 @@ class MAE(Contrastive):
         self.decoders = nn.ModuleDict()
         for modality, trunk in self.trunks.items():
             pixels = vit.patches(trunk, torch.zeros(1, spec.channels(modality), 1, 1)).shape[2]
-            other = vit.other_trunk(self.trunks, modality, config.senses)
-            self.decoders[modality] = vit.Predictor(trunk, pixels, other, 2 / 3, (512, 8))
+            self.decoders[modality] = vit.Predictor(self.trunks, modality, pixels, config.senses, 2 / 3, (512, 8))
 
     def queries(self, batch: Views) -> Embeddings:
         """("loss", modality) -> [B], the loss of each row."""

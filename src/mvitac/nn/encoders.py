@@ -18,7 +18,6 @@ from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.nn import imagenet
-from mvitac.nn.positions import sin_cos_positions
 from mvitac.nn.small_conv import use_convolutions, use_products
 from mvitac.nn.weights import load_weights, read_tensors, stem_names
 from mvitac.system.files import brief
@@ -67,6 +66,20 @@ def _small_vit(name: str, pretrained: bool, shape: dict[str, Any], kwargs: dict[
     with torch.no_grad():
         vit.pos_embed.copy_(sin_cos_positions(*vit.patch_embed.grid_size, vit.embed_dim))  # type: ignore[call-arg]
     return vit
+
+
+def sin_cos_positions(height: int, width: int, features: int, device: torch.device | None = None) -> Tensor:
+    """Fixed embeddings [height x width, ``features``] of the places of a grid, row by row (MoCo v3, arXiv:2104.02057).
+
+    The four quarters of the features are sin(row w_i), cos(row w_i), sin(column w_i), cos(column w_i), with
+    w_i = 10000^(-4 i / features).
+    """
+    assert features % 4 == 0, features
+    rates = 10000.0 ** (-torch.arange(0, features, 4, device=device, dtype=torch.float32) / features)
+    row, column = (torch.arange(side, device=device, dtype=torch.float32)[:, None] * rates for side in (height, width))
+    across_rows = torch.cat([row.sin(), row.cos()], 1)[:, None].expand(-1, width, -1)
+    across_columns = torch.cat([column.sin(), column.cos()], 1)[None].expand(height, -1, -1)
+    return torch.cat([across_rows, across_columns], 2).flatten(0, 1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -95,19 +95,13 @@ class LinearProbe(nn.Module):
 
     def __init__(self, info: ProbeInfo | ValueInfo, weight: Tensor, bias: Tensor, bounds: Tensor | None = None) -> None:
         super().__init__()
-        num = len(info.outputs)
-        if weight.ndim != 2 or weight.shape[0] != num or tuple(bias.shape) != (num,):
-            shapes = f"weights {tuple(weight.shape)} and bias {tuple(bias.shape)}"
-            raise ValueError(f"probe {info.name}: {shapes} do not fit {num} outputs: expected [{num}, D] and [{num}]")
-        if bounds is not None and bounds.shape != (2, weight.shape[1]):
-            raise ValueError(
-                f"probe {info.name}: bounds of shape {tuple(bounds.shape)}: expected [2, {weight.shape[1]}]"
-            )
-        tensors = [weight, bias] + ([] if bounds is None else [bounds])
-        if any(tensor.dtype != torch.float32 for tensor in tensors):
-            raise ValueError(f"probe {info.name}: weights are {weight.dtype}, expected torch.float32")
-        if not all(tensor.isfinite().all() for tensor in tensors):
-            raise ValueError(f"probe {info.name}: its weights are not all finite")
+        num, tensors = len(info.outputs), [weight, bias] + ([] if bounds is None else [bounds])
+        wanted = [(num, weight.shape[-1]), (num,), (2, weight.shape[-1])]
+        if any(tensor.shape != shape for tensor, shape in zip(tensors, wanted, strict=False)):
+            found = ", ".join(str(tuple(tensor.shape)) for tensor in tensors)
+            raise ValueError(f"probe {info.name}: tensors of shapes {found} do not fit {num} outputs")
+        if not all(tensor.dtype == torch.float32 and tensor.isfinite().all() for tensor in tensors):
+            raise ValueError(f"probe {info.name}: its weights are not all finite float32")
         self.info = info
         self.register_buffer("weight", weight)
         self.register_buffer("bias", bias)

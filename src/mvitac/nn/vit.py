@@ -16,8 +16,7 @@ from timm.models.vision_transformer import Block, VisionTransformer
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
-from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, PerFrame, build_trunk
-from mvitac.nn.positions import sin_cos_positions
+from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, PerFrame, build_trunk, sin_cos_positions
 
 Senses = Literal["own", "both"]  # whether a predictor sees tokens of its own modality, or of both
 _GOLDEN, _MULTIPLIERS = -0x61C8864680B583EB, (-0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15)
@@ -81,11 +80,6 @@ def build_vits(config: Encoders, spec: DataSpec, method: str, senses: Senses) ->
 def vit_of(trunk: nn.Module) -> VisionTransformer:
     """The ViT of a trunk from ``build_vits``."""
     return trunk.trunk if isinstance(trunk, PerFrame) else trunk  # type: ignore[return-value]
-
-
-def other_trunk(trunks: nn.ModuleDict, modality: str, senses: Senses) -> nn.Module | None:
-    """The trunk whose tokens a predictor of ``modality`` also reads, if there is one."""
-    return next((trunk for m, trunk in trunks.items() if m != modality), None) if senses == "both" else None
 
 
 def frames_of(trunk: nn.Module) -> int:
@@ -157,21 +151,21 @@ class Predictor(nn.Module):
     A hidden patch is a learned mask token plus the fixed sine-cosine embedding of its position.
 
     Args:
-        trunk: The trunk whose tokens it reads.
+        trunks: modality -> trunk.
+        modality: Whose tokens it reads; with ``senses`` both also those of the other one.
         out: Width of the predictions.
-        other: The trunk of the other modality, if it also reads its tokens.
         share, most: Width and number of blocks are this share of the trunk's, in whole heads of 32 features, up to ``most``.
     """
 
     def __init__(
-        self, trunk: nn.Module, out: int, other: nn.Module | None, share: float, most: tuple[int, int]
+        self, trunks: nn.ModuleDict, modality: str, out: int, senses: Senses, share: float, most: tuple[int, int]
     ) -> None:
         super().__init__()
-        vit = vit_of(trunk)
+        vit, others = vit_of(trunks[modality]), [trunk for m, trunk in trunks.items() if m != modality]
         width = min(most[0], 32 * max(1, round(vit.embed_dim * share / 32)))
         depth = min(most[1], max(1, round(len(vit.blocks) * share)))
         self.embed = nn.Linear(vit.embed_dim, width)
-        self.other = nn.Linear(vit_of(other).embed_dim, width) if other else None
+        self.other = nn.Linear(vit_of(others[0]).embed_dim, width) if senses == "both" else None
         self.mask_token = nn.Parameter(torch.zeros(1, 1, 1, width))
         norm: Any = partial(nn.LayerNorm, eps=1e-6)
         self.blocks = nn.Sequential(*(Block(width, width // 32, qkv_bias=True, norm_layer=norm) for _ in range(depth)))

@@ -1,7 +1,7 @@
 """Rows of each step, in an order that is a function of (seed, epoch)."""
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ class Batches:
     def __init__(self, run: Run, pack: Pack, rows: np.ndarray) -> None:
         self.rows, self.seed, self.shape = rows, run.seed, (run.steps_per_epoch(len(rows)), run.batch_size)
         self.touch_groups = pack.touch_groups[rows] if run.sampler != "shuffle" else None
-        self.order: Order = spread_order if run.sampler == "spread" else epoch_order
+        self.order: Order = partial(epoch_order, spread=run.sampler == "spread")
         weighted = isinstance(pack, MixedPack) and pack.weighted
         self._epoch = lru_cache(2)(PartOrder(self, pack).epoch if weighted else self._pass)  # type: ignore[arg-type]
 
@@ -115,44 +115,26 @@ def check_mix(run: Run, pack: Pack, rows: np.ndarray, world: World) -> None:
         raise ValueError(f"batch_size {run.batch_size}: parts that lack a modality need at least 3")
 
 
-def epoch_order(num: int, groups: np.ndarray | None, seed: int) -> np.ndarray:
+def epoch_order(num: int, groups: np.ndarray | None, seed: int, *, spread: bool = False) -> np.ndarray:
     """A random permutation of 0..num-1.
 
     With ``groups`` [num], one row of each group comes first, then a second row of each group, and so on. Any sequence not
-    longer than the number of groups then has hardly two rows of one group. Groups of several sizes are spread over the
-    whole length instead (``spread_order``), as the largest would fill the last batches.
+    longer than the number of groups then has hardly two rows of one group. With ``spread``, and where groups differ in
+    size, as the largest would fill the last batches, rows of a group are far apart instead: c of them lie 1 / c of the
+    length apart, give or take a fifth of that, around the end too.
     """
     rng = np.random.default_rng(seed)
     order = rng.permutation(num)
     if groups is None:
         return order
-    occurrence, _, counts = _occurrences(groups[order])
-    if counts.min() < counts.max():
-        return spread_order(num, groups, seed)
-    return order[np.argsort(occurrence, kind="stable")]
-
-
-def spread_order(num: int, groups: np.ndarray | None, seed: int) -> np.ndarray:
-    """A random permutation of 0..num-1 in which the rows of each of ``groups`` [num] are far apart.
-
-    The c rows of a group lie 1 / c of the length apart, give or take a fifth of that, around the end too.
-    """
-    assert groups is not None
-    rng = np.random.default_rng(seed)
-    order = rng.permutation(num)
-    occurrence, inverse, counts = _occurrences(groups[order])
+    _, inverse, counts = np.unique(groups[order], return_inverse=True, return_counts=True)
+    occurrence = np.empty(num, np.int64)  # how often the row's group came before
+    firsts = np.repeat(np.cumsum(counts) - counts, counts)
+    occurrence[np.argsort(inverse, kind="stable")] = np.arange(num) - firsts
+    if not spread and counts.min() == counts.max():
+        return order[np.argsort(occurrence, kind="stable")]
     start, jitter = rng.random(len(counts)), rng.uniform(-0.1, 0.1, num)
     return order[np.argsort((occurrence + start[inverse] + jitter) / counts[inverse] % 1)]
-
-
-def _occurrences(groups: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """For each of ``groups`` [N]: how often the same came before, and its number; and the size of each number's group."""
-    _, inverse, counts = np.unique(groups, return_inverse=True, return_counts=True)
-    occurrence = np.empty(len(groups), np.int64)
-    occurrence[np.argsort(inverse, kind="stable")] = np.arange(len(groups)) - np.repeat(
-        np.cumsum(counts) - counts, counts
-    )
-    return occurrence, inverse, counts
 
 
 def partners(

@@ -101,15 +101,12 @@ def _record(setup: Setup, asked: Run, out: Path, start: Start | None, taken: dic
     """Write run.json and the hashes of the rows that the run learns from, and say what it starts from."""
     run, pack = setup.run, setup.pack
     if not (out / "run.json").exists():
-        record = {
-            **{"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(setup.spec)},
-            **{"device": describe(setup.hardware.device), "precision": run.precision},
-            **{"bf16_slowdown": setup.hardware.slowdown},
-        }
-        said = []
-        used = {m: run.encoder[m] for m in setup.method.encoders() if run.encoder[m].weights == IMAGENET}
+        record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(setup.spec)}
+        record |= {"device": describe(setup.hardware.device), "precision": run.precision}
+        record["bf16_slowdown"], said = setup.hardware.slowdown, []
+        used = [m for m in setup.method.encoders() if run.encoder[m].weights == IMAGENET]
         if used:
-            record["imagenet"] = {m: source(config.trunk) for m, config in used.items()}
+            record["imagenet"] = {m: source(run.encoder[m].trunk) for m in used}
             said += [f"{m} starts from ImageNet weights of {found}" for m, found in record["imagenet"].items()]
         if start:
             record["start"] = taken
