@@ -6,17 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from sklearn.linear_model import Ridge
 from sklearn.metrics import mean_absolute_error, r2_score, root_mean_squared_error
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack
-from mvitac.data.spec import Target, ValueTask
-from mvitac.datasets.folder import FolderConfig
+from mvitac.data.spec import Target
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.intervals import interval, paired_difference
@@ -192,24 +189,6 @@ def test_probes_of_classes_and_values_side_by_side(measured: Pack, tmp_path: Pat
 
 
 # -- data -------------------------------------------------------------------------------------------------------------
-
-
-def test_columns_of_a_table_become_values(tmp_path: Path) -> None:
-    lines = ["touch,group,force_n,z_mm"]
-    for i in range(20):
-        Image.new("RGB", (16, 16), (i, i, i)).save(tmp_path / f"{i}.png")
-        lines.append(f"{i}.png,g{i},{i / 4 if i % 5 else ''},{i / 2}")
-    (tmp_path / "pairs.csv").write_text("\n".join(lines))
-    config = FolderConfig(path=tmp_path / "pairs.csv", values=("force_n:N", "pose=z_mm:mm,force_n:N"), size=16)
-    pack = build(config.source(), tmp_path / "pack", size=16, workers=1, quiet=True)
-    force, pose = pack.spec.values
-    assert force == ValueTask(name="force_n", targets=NEWTON)
-    assert [target.name for target in pose.targets] == ["z_mm", "force_n"]
-    values = pack.values(pose)
-    assert np.array_equal(np.isnan(values[:, 1]), np.arange(20) % 5 == 0)
-    assert np.array_equal(values[:, 0], np.arange(20) / 2)
-    assert Pack(pack.path).spec == pack.spec
-    assert set(pack.column("split")) == {"train", "val", "test"}
 
 
 def test_packs_with_other_units_cannot_be_joined(measured: Pack) -> None:

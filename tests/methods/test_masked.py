@@ -9,19 +9,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec, Window
 from mvitac.methods.base import Method, Views
 from mvitac.methods.ijepa import IJEPA, Blocks, IJEPAConfig, multi_block
 from mvitac.methods.mae import MAE, MAEConfig, split_patches
-from mvitac.nn.encoders import PerFrame, sin_cos_positions
+from mvitac.nn.encoders import sin_cos_positions
 from mvitac.nn.vit import Predictor, row_uniform
 from mvitac.recipes import recipe
-from mvitac.training.sampler import Batches
-from mvitac.training.views import StepViews
 from support.small_methods import TINY, TINY_VIT, build, outcome, views
 from support.toy import Toy
-from support.training_runs import smoke
 
 GRID, SIDE = (4, 4), 8
 MASKED = {"mae": MAEConfig(), "ijepa": IJEPAConfig()}
@@ -197,9 +193,7 @@ def test_ijepa_is_smooth_l1_to_the_teachers_normalised_tokens(senses: str) -> No
 
 
 def test_the_teacher_follows_with_a_linear_momentum() -> None:
-    config = IJEPAConfig()
-    assert [config.ema_at(p) for p in (0.0, 0.25, 0.5, 1.0)] == pytest.approx([0.996, 0.997, 0.998, 1.0])
-    method = build("ijepa", config=replace(config, ema=0.5))
+    method = build("ijepa", config=IJEPAConfig(ema=0.5))
     assert isinstance(method, IJEPA)
     student, teacher = method.trunks["touch"].norm.weight, method.teachers["touch"].module.norm.weight  # type: ignore[union-attr]
     with torch.no_grad():
@@ -213,25 +207,16 @@ def test_the_teacher_follows_with_a_linear_momentum() -> None:
 
 
 @pytest.mark.parametrize("name", MASKED)
-def test_frames_are_channels_or_images_with_one_mask(name: str) -> None:
-    """A window of two equal frames: frame by frame it has the loss of one frame."""
+def test_frames_are_channels(name: str) -> None:
     window = Window(frames=2, stride=1, of=("vision", "touch"))
-    config, seen = MASKED[name], spec(window=window)
-    single = build(name)
-    batch = views(single, num=4)
+    config, seen, batch = MASKED[name], spec(window=window), views(build(name), num=4)
     twice = Views(images={m: [v[0].repeat(1, 2, 1, 1)] for m, v in batch.images.items()}, labels={}, rows=batch.rows)
-    torch.manual_seed(0)
-    each = config.build(seen, TINY_VIT.changed(temporal="mean"))
-    assert all(isinstance(trunk, PerFrame) for trunk in each.encoders().values())
-    states = zip(each.state_dict(), single.state_dict().values(), strict=True)  # in the same order
-    each.load_state_dict(dict(states))
-    assert numbers(each, twice)["loss"] == pytest.approx(numbers(single, batch)["loss"], rel=1e-5)
     stacked = config.build(seen, TINY_VIT)
     assert torch.isfinite(outcome(stacked, twice)["loss"])
     if isinstance(stacked, MAE):
         assert stacked.decoders["touch"].out.out_features == 6 * SIDE**2  # type: ignore[union-attr]
-    with pytest.raises(ValueError, match=r"senses both .*--encoder\.temporal stack"):
-        replace(config, senses="both").build(seen, TINY_VIT.changed(temporal="mean"))
+    with pytest.raises(ValueError, match=r"reads the frames of a window together.*--encoder\.temporal stack"):
+        config.build(seen, TINY_VIT.changed(temporal="mean"))
 
 
 @pytest.mark.parametrize("name", MASKED)
@@ -246,17 +231,3 @@ def test_other_trunks_and_views_of_one_patch_are_refused(name: str) -> None:
         small.check(spec(), 100, 72)
     with pytest.raises(ValueError, match="senses both: dataset 'toy' has touch only"):
         replace(config, senses="both").build(Toy(vision_channels=0).spec(), TINY_VIT)
-
-
-def test_each_step_has_its_seed_and_a_resumed_run_the_same(pack: Pack) -> None:
-    run = smoke(pack)
-
-    def seeds(start: int, chunk: int = 0) -> list[list[int]]:
-        rows = run.method.training_rows(pack)
-        views = StepViews(replace(run, chunk=chunk), pack, 1, torch.device("cpu"))
-        made = views.each(Batches(run, pack, rows), start, 4)
-        return [[int(view().seed) for view in chunks] for chunks in made]
-
-    straight = seeds(0)
-    assert len({seed for step in straight for seed in step}) == 4 and seeds(2) == straight[2:]
-    assert all(len(set(step)) == 2 for step in seeds(0, chunk=8))

@@ -1,9 +1,7 @@
 """Files, locks, threads and progress: complete or not at all, the same side by side, and nothing goes unnoticed."""
 
-import io
 import json
 import shutil
-import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -54,25 +52,6 @@ def test_a_new_folder_is_complete_or_not_there(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="already exists"), new_folder(tmp_path / "out"):
         pass
     assert [path.name for path in tmp_path.rglob("*")] == ["out", "file"]
-
-
-@pytest.mark.parametrize("on_terminal", [True, False])
-def test_bars_tell_the_time_left_and_tick_counts_the_innermost(
-    on_terminal: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stream, now = io.StringIO(), [0.0]
-    monkeypatch.setattr(stream, "isatty", lambda: on_terminal)
-    monkeypatch.setattr(sys, "stderr", stream)
-    monkeypatch.setattr("tqdm.std.time", lambda: now[0])
-    with shown(), work("probing", 30, "probes"), work("pre-training", 100, "steps", done=10) as advance:
-        for _ in range(8):
-            now[0] += 20
-            tick("probes")
-            advance(1, "loss 3.21")
-    text = stream.getvalue()
-    for words in ("pre-training", "18/100", "<27:20", "20.00s/ steps", "loss 3.21", "probing", "8/30"):
-        assert words in text, (words, text)
-    assert ("\x1b[" in text) == on_terminal  # a file gets no cursor movements
 
 
 def test_nothing_is_shown_unasked(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

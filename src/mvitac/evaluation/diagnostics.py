@@ -1,7 +1,4 @@
-"""Measures of feature quality and collapse: spread, rank, alignment, modality gap, a linear probe, retrieval.
-
-Shapes: features [N, D] of one modality. Row i of vision and row i of touch are a pair.
-"""
+"""Measures of feature quality and collapse: spread, rank, a linear probe, retrieval. Shapes: features [N, D]."""
 
 from collections.abc import Iterable, Sequence
 
@@ -28,30 +25,6 @@ def rank_me(z: Float[Tensor, "N D"]) -> float:
     p = torch.linalg.svdvals(z.double())
     p = p / p.sum().clamp(min=1e-12)
     return float(torch.exp(-(p * torch.log(p + 1e-12)).sum()))
-
-
-def alignment(a: Float[Tensor, "N D"], b: Float[Tensor, "N D"]) -> float:
-    """Mean squared distance of paired normalised embeddings (0 = pairs agree, 2 = orthogonal).
-
-    Source: https://arxiv.org/abs/2005.10242 (Wang and Isola).
-    """
-    return float((F.normalize(a.float(), dim=1) - F.normalize(b.float(), dim=1)).square().sum(1).mean())
-
-
-def uniformity(z: Float[Tensor, "N D"]) -> float:
-    """log E exp(-2 |z_i - z_j|^2) over pairs of normalised embeddings: 0 = collapsed, -4 = spread over the sphere.
-
-    Source: https://arxiv.org/abs/2005.10242 (Wang and Isola).
-    """
-    return float(torch.pdist(F.normalize(z.float(), dim=1)).square().mul(-2).exp().mean().log())
-
-
-def modality_gap(a: Float[Tensor, "N D"], b: Float[Tensor, "M D"]) -> float:
-    """Distance between the mean normalised embeddings of two modalities (0 = same mean, at most 2).
-
-    Source: https://arxiv.org/abs/2203.02053 (Liang et al., section 2).
-    """
-    return float((F.normalize(a.float(), dim=1).mean(0) - F.normalize(b.float(), dim=1).mean(0)).norm())
 
 
 ALPHAS = (10.0, 100.0, 1e3, 1e4, 1e5)  # candidate strengths of the ridge regularisation of ``linear_probe``

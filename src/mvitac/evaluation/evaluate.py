@@ -125,8 +125,6 @@ def _check_paths(paths: Sequence[Path], encoders: Sequence[str]) -> None:
     if not (paths or encoders):
         raise ValueError("give at least one run's folder")
     for path in paths:
-        if path.is_file():
-            raise ValueError(f"{path} is a file: give the run's folder, where the scores are also written")
         if [p.resolve() for p in paths].count(path.resolve()) > 1:
             raise ValueError(f"run {path} is given twice: it would count as two seeds, give it once")
         if path != BASE:

@@ -7,8 +7,7 @@ predicts, block by block, the tokens that a momentum (teacher) copy has for the 
 
 averaged over blocks, patches and features. The layer norm has no weights, and smooth L1 turns at 1. The teacher follows with
 a momentum that rises linearly from .996 to 1. With ``senses both`` the predictor of touch also gets vision's context tokens,
-and that of vision touch's; each encoder still sees its own modality only. Windows: as channels of one image, or
-(``--encoder.temporal mean``) frame by frame with one set of blocks.
+and that of vision touch's; each encoder still sees its own modality only. The frames of a window are channels of one image.
 
 Block sizes are drawn once per batch (per chunk, with ``--chunk``), places once per image, as in the authors' code. Different
 here, because masks are made on the device without waiting for it:
@@ -73,10 +72,6 @@ class IJEPAConfig(MethodConfig):
     def build(self, spec: DataSpec, encoder: Encoders) -> "IJEPA":
         return IJEPA(self, spec, encoder)
 
-    def ema_at(self, progress: float) -> float:
-        """Momentum of the teacher at ``progress`` (0 to 1) of the run."""
-        return self.ema + (1 - self.ema) * progress
-
 
 @dataclass(frozen=True)
 class Blocks:
@@ -86,11 +81,6 @@ class Blocks:
     in_context: Bool[Tensor, "B K"]  # which places of ``context`` are used
     targets: Int[Tensor, "B M S"]
     in_target: Bool[Tensor, "B M S"]
-
-    def each(self, num: int) -> "Blocks":
-        """Every image ``num`` times in a row."""
-        found = (self.context, self.in_context, self.targets, self.in_target)
-        return self if num == 1 else Blocks(*(tensor.repeat_interleave(num, 0) for tensor in found))
 
 
 def block_sides(area: Tensor, aspect: Tensor, grid: tuple[int, int]) -> Tensor:
@@ -158,10 +148,10 @@ class IJEPA(Contrastive):
         """The blocks of each image that the ViT of ``modality`` sees."""
         trunk, stream = self.trunks[modality], list(self.trunks).index(modality)
         grid = vit.grid_of(trunk, batch.images[modality][0])
-        return multi_block(self.config, batch.seed, batch.rows, stream, grid).each(vit.frames_of(trunk))
+        return multi_block(self.config, batch.seed, batch.rows, stream, grid)
 
     def queries(self, batch: Views) -> Embeddings:
-        """("predicted", modality) -> [B, M S, D], with the frames of a window one after another."""
+        """("predicted", modality) -> [B, M S, D]."""
         found = {m: self.blocks(batch, m) for m in self.trunks}
         seen = {}
         for m, blocks in found.items():
@@ -170,21 +160,21 @@ class IJEPA(Contrastive):
         for modality, blocks in found.items():
             other = next((seen[m] for m in seen if m != modality), None)
             predicted = self.predictors[modality](seen[modality], blocks.targets, blocks.in_target, other)
-            result["predicted", modality] = predicted.reshape(len(batch.rows), -1, predicted.shape[-1])
+            result["predicted", modality] = predicted.flatten(1, 2)
         return result
 
     @torch.no_grad()
     def keys(self, batch: Views) -> Embeddings:
         """("target", modality) -> [B, M S, D], and ("weight", modality) -> [B, M S], which sums to 1 for each row."""
         result: Embeddings = {}
-        for modality, trunk in self.trunks.items():
+        for modality in self.trunks:
             blocks = self.blocks(batch, modality)
             teacher: VisionTransformer = self.teachers[modality].module  # type: ignore[assignment]
-            tokens = teacher.forward_features(vit.each_frame(trunk, batch.images[modality][0]))
+            tokens = teacher.forward_features(batch.images[modality][0])
             tokens = tokens[:, teacher.num_prefix_tokens :]
             target = vit.take(F.layer_norm(tokens.float(), tokens.shape[-1:]), blocks.targets.flatten(1))
-            used = blocks.in_target.reshape(len(batch.rows), -1).float()
-            result["target", modality] = target.reshape(len(batch.rows), -1, target.shape[-1])
+            used = blocks.in_target.flatten(1).float()
+            result["target", modality] = target
             result["weight", modality] = used / used.sum(1, keepdim=True)
         return result
 
@@ -200,4 +190,4 @@ class IJEPA(Contrastive):
 
     def after_step(self, progress: float) -> None:
         for teacher in self.teachers.values():
-            teacher.follow(self.config.ema_at(progress))  # type: ignore[operator]
+            teacher.follow(self.config.ema + (1 - self.config.ema) * progress)  # type: ignore[operator]

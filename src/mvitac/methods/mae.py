@@ -8,9 +8,8 @@ each hidden patch, and predicts the hidden pixels:
 The variance is the unbiased one (P - 1), as in the authors' code; Sparsh predicts plain pixels (``pixel_norm`` off). With
 ``senses both`` the decoder of touch also gets the tokens of vision's visible patches, and that of vision those of touch, as
 in MultiMAE (Bachmann et al., arXiv:2204.01678). Each encoder still sees its own modality only.
-Windows: with frames as channels a patch spans all F frames, so that masks are tubes (VideoMAE, Tong et al.,
-arXiv:2203.12602, with one tubelet). With ``--encoder.temporal mean`` each frame is an image of its own, and the frames of a
-window share one mask.
+The frames of a window are channels: a patch spans all of them, so that masks are tubes (VideoMAE, Tong et al.,
+arXiv:2203.12602, with one tubelet).
 Sources: the paper (section 3, appendix A); facts of https://github.com/facebookresearch/mae (models_mae.py).
 Not implemented: the authors' optimiser (the recipe's, for all methods), and fixed positions in the encoder (here the
 trunk's own).
@@ -93,8 +92,7 @@ class MAE(Contrastive):
         for stream, (modality, trunk) in enumerate(self.trunks.items()):
             images = batch.images[modality][0]
             noise = vit.row_uniform(batch.seed, batch.rows, math.prod(vit.grid_of(trunk, images)), stream)
-            parts = split_patches(noise, self.config.mask_ratio)
-            visible, hidden[modality] = (at.repeat_interleave(vit.frames_of(trunk), 0) for at in parts)
+            visible, hidden[modality] = split_patches(noise, self.config.mask_ratio)
             seen[modality] = vit.encode_visible(trunk, images, visible)
         result: Embeddings = {}
         for modality, trunk in self.trunks.items():
@@ -105,7 +103,7 @@ class MAE(Contrastive):
             with torch.autocast(images.device.type, enabled=False):
                 values = vit.take(vit.patches(trunk, images.float()), hidden[modality])
                 error = (predicted.float() - pixel_targets(values, self.config.pixel_norm)) ** 2
-                result["loss", modality] = error.view(len(batch.rows), -1).mean(1)
+                result["loss", modality] = error.flatten(1).mean(1)
         return result
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:

@@ -105,9 +105,7 @@ class MViTacConfig(MethodConfig):
             if "press" in pack.table.column_names:
                 pairs = np.unique(np.stack([pack.presses[rows], pack.sensors[rows]]), axis=1)
             if not (np.bincount(pairs[0]) > 1).any():
-                raise ValueError(
-                    "lambda_sensor needs rows of one press (column press) and different sensors (column sensor)"
-                )
+                raise ValueError("lambda_sensor needs rows of one press (column press) and of different sensors")
         has = {modality: pack.has(modality)[rows] for modality in pack.spec.modalities}
         parts = [PARTS[part] for part in self.losses if set(PARTS[part]) <= has.keys()]
         return rows[np.any([has[x] & has[y] for x, y in parts], axis=0)] if parts else rows

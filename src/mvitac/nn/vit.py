@@ -16,7 +16,7 @@ from timm.models.vision_transformer import Block, VisionTransformer
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
-from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, PerFrame, build_trunk, sin_cos_positions
+from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, build_trunk, sin_cos_positions
 
 Senses = Literal["own", "both"]  # whether a predictor sees tokens of its own modality, or of both
 _GOLDEN, _MULTIPLIERS = -0x61C8864680B583EB, (-0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15)
@@ -59,37 +59,26 @@ def _plain(trunk: nn.Module, name: str, method: str) -> VisionTransformer:
 
 
 def build_vits(config: Encoders, spec: DataSpec, method: str, senses: Senses) -> nn.ModuleDict:
-    """A ViT per modality of ``spec``, or ``PerFrame`` of one, whose features are the mean over its patches.
+    """A ViT per modality of ``spec``, whose features are the mean over its patches, as no class token is trained here.
 
-    The mean because no class token is trained here. ValueError if the trunk is no plain ViT, or ``senses`` or
-    how windows are read does not fit the data.
+    ValueError if the trunk is no plain ViT, or ``senses`` or how windows are read does not fit the data.
     """
     if senses == "both" and len(spec.modalities) < 2:
         have = ", ".join(spec.modalities)
         raise ValueError(f"senses both: dataset {spec.name!r} has {have} only, give --method.senses own")
     trunks = nn.ModuleDict()
     for modality in spec.modalities:
-        own, windows = config[modality], spec.frames(modality) > 1
-        if windows and own.temporal == "mean" and senses == "both":
-            raise ValueError("senses both reads the frames of a window together: give --encoder.temporal stack")
-        trunks[modality] = build_trunk(own, spec.channels(modality), spec.frames(modality))
-        _plain(vit_of(trunks[modality]), own.trunk, method).reset_classifier(0, "avg")
+        own = config[modality]
+        if spec.frames(modality) > 1 and own.temporal == "mean":
+            raise ValueError(f"method {method!r} reads the frames of a window together: give --encoder.temporal stack")
+        trunks[modality] = _plain(build_trunk(own, spec.channels(modality)), own.trunk, method)
+        vit_of(trunks[modality]).reset_classifier(0, "avg")
     return trunks
 
 
 def vit_of(trunk: nn.Module) -> VisionTransformer:
-    """The ViT of a trunk from ``build_vits``."""
-    return trunk.trunk if isinstance(trunk, PerFrame) else trunk  # type: ignore[return-value]
-
-
-def frames_of(trunk: nn.Module) -> int:
-    """Number of frames that a trunk from ``build_vits`` reads one by one. B images are then rows x frames."""
-    return trunk.frames if isinstance(trunk, PerFrame) else 1
-
-
-def each_frame(trunk: nn.Module, images: Tensor) -> Tensor:
-    """The images that the ViT of a trunk sees: [R, F C, H, W] to [R F, C, H, W]."""
-    return images.unflatten(1, (frames_of(trunk), -1)).flatten(0, 1)
+    """A trunk from ``build_vits`` by its type."""
+    return trunk  # type: ignore[return-value]
 
 
 def grid_of(trunk: nn.Module, images: Tensor) -> tuple[int, int]:
@@ -102,7 +91,7 @@ def patches(trunk: nn.Module, images: Tensor) -> Float[Tensor, "B N P"]:
     """The pixels of each patch, P = C x side x side. Like timm's ViT, images are padded at the bottom and the right."""
     side = vit_of(trunk).patch_embed.patch_size[0]
     padding = (0, -images.shape[3] % side, 0, -images.shape[2] % side)
-    return F.unfold(F.pad(each_frame(trunk, images), padding), side, stride=side).mT
+    return F.unfold(F.pad(images, padding), side, stride=side).mT
 
 
 def take(tokens: Float[Tensor, "B N D"], at: Int[Tensor, "B K"]) -> Float[Tensor, "B K D"]:
@@ -128,7 +117,7 @@ def encode_visible(
     ``live`` says which of ``at`` count; no token attends to the others.
     """
     vit = vit_of(trunk)
-    tokens = vit.norm_pre(vit._pos_embed(vit.patch_embed(each_frame(trunk, images))))
+    tokens = vit.norm_pre(vit._pos_embed(vit.patch_embed(images)))
     front = vit.num_prefix_tokens
     tokens = torch.cat([tokens[:, :front], take(tokens[:, front:], at)], dim=1)
     live = None if live is None else F.pad(live, (front, 0), value=True)

@@ -138,7 +138,7 @@ def _column(entries: list[dict[str, Any]], key: str) -> tuple[list[float], list[
 
 
 def collapse(study: Study) -> list[Markup]:
-    """What training measured on held-out groups: std, rank, alignment, uniformity, gap, linear probe, R@5."""
+    """What training measured on held-out groups: std, rank, linear probe, R@5."""
     drawn = []
     chances = [e["eval"]["chance R@5"] for r in study.runs for e in r.log if "chance R@5" in e.get("eval", {})]
     for title, keys, caption in _panels(study):
@@ -167,9 +167,6 @@ def _panels(study: Study) -> list[tuple[str, dict[str, tuple[str, str]], str]]:
     return [
         ("std of the features", each("std"), "About 1: spread out; 0: collapsed."),
         ("effective rank", each("rankme"), "RankMe; 1: collapsed, higher is richer."),
-        ("alignment", {"alignment": ("pairs", "green")}, "Squared distance of pairs; 0: they agree, 2: unrelated."),
-        ("uniformity", each("uniformity"), "0: collapsed; −4: spread over the sphere."),
-        ("modality gap", {"modality gap": ("touch to vision", "green")}, "Distance of the two means; 0: mixed."),
         *((f"linear probe, {task.name}", each(f"linear {task.name}"), probe) for task in study.pack.spec.all_tasks),
         ("retrieval R@5", across, "Own group among the first five, in the space both share."),
     ]

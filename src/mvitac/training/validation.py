@@ -218,17 +218,14 @@ def _change(start: Tensor, end: Tensor) -> tuple[float, float]:
 
 
 def _shared_space(model: Model, pack: Pack, run: Run, rows: np.ndarray, z: dict[str, Tensor]) -> dict[str, float]:
-    """Alignment, uniformity and retrieval in the space shared by both modalities, on ``rows``, whose features are ``z``."""
+    """Retrieval in the space shared by both modalities, among ``rows``, whose features are ``z``."""
     device = next(model.parameters()).device
     for m, (whole, heads) in {m: model.sides(m) for m in z}.items():
         if whole != heads:
             z = z | {m: pack_features(model, pack, m, rows, for_heads=True, bf16=run.bf16)}
     shared = {m: model.project(m, z[m].to(device)).cpu() for m in z}
     groups = torch.from_numpy(np.unique(pack.column("group")[rows], return_inverse=True)[1])
-    values = {"alignment": diagnostics.alignment(shared["vision"], shared["touch"])}
-    values["modality gap"] = diagnostics.modality_gap(shared["vision"], shared["touch"])
-    for modality in shared:
-        values[f"{modality}/uniformity"] = diagnostics.uniformity(shared[modality])
+    values = {}
     for query, gallery in (("vision", "touch"), ("touch", "vision")):
         ranks = diagnostics.retrieval_ranks(shared[query], shared[gallery], groups)
         for name, value in diagnostics.recall_at(ranks, (1, 5)).items():
