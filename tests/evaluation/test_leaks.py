@@ -14,7 +14,7 @@ from PIL import Image
 
 import mvitac
 from mvitac.bench.external import open_model
-from mvitac.bench.external.timm_models import said
+from mvitac.bench.external.adapters import said
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack

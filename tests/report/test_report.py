@@ -29,12 +29,10 @@ from mvitac.evaluation.evaluate import ProbeConfig, probe_runs, stored_result
 from mvitac.evaluation.intervals import interval
 from mvitac.evaluation.score_text import cell_text, columns_of, verdicts
 from mvitac.evaluation.scores import summarise
-from mvitac.experiments.plan import Plan, Row
 from mvitac.experiments.table import lines_of
 from mvitac.experiments.table_formats import latex, markdown
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.recipes import recipe
-from mvitac.registry import to_json
 from mvitac.report import figures
 from mvitac.report.galleries import nearest_groups, nearest_rows
 from mvitac.report.report import write_report
@@ -43,6 +41,7 @@ from mvitac.run import Run
 from mvitac.system.files import read_json, write_json
 from mvitac.training.loop import train
 from support.pages import drawings
+from support.small_plans import compared
 
 
 class Page(HTMLParser):
@@ -148,14 +147,8 @@ def test_shows_every_score_of_the_probe(materials: Path, result: dict[str, Any])
     assert set(result["summary"]) == {"category", "soft", "rough", "force"}
     for task, found in result["summary"].items():
         sources = {source for cells in found.values() for source in cells}
-        assert sources == {
-            "mvitac",
-            "imagenet",
-            "untrained",
-            "pixels",
-            "border",
-            "mean" if task == "force" else "majority",
-        }
+        controls = {"imagenet", "untrained", "pixels", "border", "mean" if task == "force" else "majority"}
+        assert sources == {"mvitac", *controls}
         for source in sources:
             assert shown[task, source] == [cell_text(found, source, m) for m in columns_of(found)]
 
@@ -180,9 +173,8 @@ def test_asks_nothing_of_the_network(materials: Path) -> None:
     assert not {"script", "link", "iframe", "object", "embed", "form"} & {tag for tag, _ in page.tags}
     for _, attributes in page.tags:
         for name in ("src", "href", "srcset", "data"):
-            assert (attributes.get(name) or "#").startswith(
-                ("#", "data:image/jpeg;base64,", "data:image/svg+xml;base64,")
-            )
+            allowed = ("#", "data:image/jpeg;base64,", "data:image/svg+xml;base64,")
+            assert (attributes.get(name) or "#").startswith(allowed)
     assert all(image["alt"] for image in page.all("img"))
     ids = [a["id"] for _, a in page.tags if "id" in a]
     assert len(ids) == len(set(ids)) and {a["href"] for a in page.all("a")} == {f"#{id_}" for id_ in ids}
@@ -237,9 +229,8 @@ def test_gallery_agrees_with_the_score(materials: Path, result: dict[str, Any]) 
         assert int(rank[2]) == result["retrieval"][0]["num_groups"]
         marks = re.findall(r'<div class="(right|same|wrong)">', query)
         assert len(marks) == 5
-        assert [i + 1 for i, mark in enumerate(marks) if mark == "right"] == (
-            [int(rank[1])] if int(rank[1]) < 6 else []
-        )
+        right = [place for place, mark in enumerate(marks, 1) if mark == "right"]
+        assert right == ([int(rank[1])] if int(rank[1]) < 6 else [])
 
 
 def test_hostile_names_stay_text(tmp_path: Path) -> None:
@@ -295,10 +286,8 @@ def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
 
 
 def test_bars_carry_leaks_and_lines_spare_the_names() -> None:
-    bars = figures.bars(
-        "x", {"touch": {"a": {"mean": 0.5, "low": 0.4, "high": 0.6, "leak": "3 of 4"}}}, {"majority": 0.1}, "%"
-    )
-    bars = bars.axes[0]
+    cell = {"mean": 0.5, "low": 0.4, "high": 0.6, "leak": "3 of 4"}
+    bars = figures.bars("x", {"touch": {"a": cell}}, {"majority": 0.1}, "%").axes[0]
     assert "50.0 LEAK" in [text.get_text() for text in bars.texts]
     dashed = [line for line in bars.lines if line.get_linestyle() == "--"]
     assert len(dashed) == 1 and min(dashed[0].get_ydata()) > 0  # below the group's name at y = 0
@@ -306,21 +295,11 @@ def test_bars_carry_leaks_and_lines_spare_the_names() -> None:
 
 def test_retrieval_has_one_number_for_one_thing() -> None:
     """R@5 of the table is the mean of its interval, also where float32 would round to another tenth."""
-    counts = {"group_sizes": [2000], "group_correct": [3], "seed": 0}
-    record = {
-        "source": "a",
-        "direction": "x",
-        "R@1": 0.1,
-        "R@5": float(np.float32(3 / 2000)),
-        "R@10": 0.1,
-        "chance R@5": 0.1,
-    }
-    mean = interval([{**record, **counts}])[0]
-    assert retrieval_rows([{**record, **counts}])[0][3] == f"{100 * mean:.1f}"
+    recalls = {"R@1": 0.1, "R@5": float(np.float32(3 / 2000)), "R@10": 0.1, "chance R@5": 0.1}
+    record = {"source": "a", "direction": "x", **recalls, "group_sizes": [2000], "group_correct": [3], "seed": 0}
+    mean = interval([record])[0]
+    assert retrieval_rows([record])[0][3] == f"{100 * mean:.1f}"
     assert f"{100 * record['R@5']:.1f}" != f"{100 * mean:.1f}"  # what this is about
-
-
-RUNS: dict[str, Any] = {"run_commits": [], "run_devices": ["cpu"], "run_precisions": {}, "notes": [], "encoders": []}
 
 
 def texts_of(records: Sequence[dict[str, Any]]) -> dict[tuple[str, ...], str]:
@@ -334,18 +313,7 @@ def texts_of(records: Sequence[dict[str, Any]]) -> dict[tuple[str, ...], str]:
 
 
 def test_report_and_comparison_give_one_text_for_one_score(materials: Path, result: dict[str, Any]) -> None:
-    plan = Plan(name="one", rows=(Row(label="mvitac"),), reference="mvitac", recipe="smoke")
-    kept = {
-        "left_out": {},
-        "failed": {},
-        "unfinished": [],
-        "leaks": "",
-        "cost": [],
-        "commit": None,
-        "device": "cpu",
-        **RUNS,
-    }
-    whole = {**result, **kept, "plan": to_json(plan), "rows": ["mvitac"]}
+    whole = compared(result)
     html = (materials / "out" / "report.html").read_text()
     page, drawn, lines = Page(html).text, "".join(drawings(html)), lines_of(whole)
     tex = latex(whole, lines)

@@ -21,8 +21,8 @@ from mvitac.evaluation.leaks import UNKNOWN, leak_mark
 from mvitac.evaluation.score_text import percent, score_name, tested_on, with_interval
 from mvitac.evaluation.scores import by_cell, summarise
 from mvitac.report.figures import STYLE, new_figure, to_svg
+from mvitac.report.html import COLOURS
 from mvitac.report.html import blocks as page
-from mvitac.report.palette import COLOURS
 from mvitac.report.tables import probe_name
 from mvitac.system.files import fields_of, write_atomic
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mvitac.bench.external import ExternalModel
-from mvitac.bench.external.base import NOTHING
+from mvitac.bench.external.adapters import NOTHING
 from mvitac.bench.result import FORM, GUESS, read_signed, sign, write_result, wrong_name
 from mvitac.bench.score import Entry, score_suite
 from mvitac.bench.suite import Suite

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.bench.external.base import parse
+from mvitac.bench.external.adapters import parse
 from mvitac.bench.suite import Suite, SuiteSet, SuiteTask, find_suite, pinned, shipped
 from mvitac.evaluation import few_labels
 from mvitac.evaluation.controls import CONTROLS

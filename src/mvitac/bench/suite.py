@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mvitac.bench.external.base import parse
+from mvitac.bench.external.adapters import parse
 from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack
 from mvitac.data.spec import AnyTask, Task

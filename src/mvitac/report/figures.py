@@ -20,8 +20,7 @@ from matplotlib.ticker import MaxNLocator
 
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import percent
-from mvitac.report.html import data_uri
-from mvitac.report.palette import COLOURS, CONTROL_GREYS, HUES, MODALITY_HUES
+from mvitac.report.html import COLOURS, CONTROL_GREYS, HUES, MODALITY_HUES, data_uri
 
 MARKERS = ("o", "^", "s", "D", "v", "P", "X", "*")
 DASHES = ("-", "--", ":", "-.")

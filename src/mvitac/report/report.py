@@ -1,6 +1,5 @@
 """The report of finished runs as one HTML page: verdict, tables, curves, pictures, settings, cost. No network."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
@@ -190,8 +189,7 @@ def _settings(study: Study) -> list[Markup]:
         [key, *(str(flat.get(key, "")) for flat in each)] for key in dict.fromkeys(k for flat in each for k in flat)
     ]
     shown = page.table(["", *names], rows, words=True, label="settings")
-    records = [(f"{r.path / 'run.json'} in full", json.dumps(r.record, indent=1)) for r in study.runs]
-    return [page.fold("Every setting", shown), *(page.fold(name, page.code(text)) for name, text in records)]
+    return [page.fold("Every setting", shown)]
 
 
 def _cost(study: Study) -> list[Markup]:

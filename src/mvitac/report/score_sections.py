@@ -5,7 +5,6 @@ from typing import Any
 
 from markupsafe import Markup
 
-from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import (
     MODALITY_ORDER,
     WORDS,
@@ -22,8 +21,8 @@ from mvitac.evaluation.score_text import (
 )
 from mvitac.evaluation.scores import by_cell, summarise_again
 from mvitac.report import figures, tables
+from mvitac.report.html import CONTROL_GREYS, MODALITY_HUES
 from mvitac.report.html import blocks as html
-from mvitac.report.palette import CONTROL_GREYS, MODALITY_HUES
 from mvitac.report.sections import Study
 
 
@@ -47,7 +46,6 @@ def probe(study: Study) -> list[Markup]:
         names = " and ".join(dict.fromkeys(tables.probe_name(kind, score_name(cells)) for cells in again.values()))
         numbers.append(html.fold(f"The same by {names}", html.grid(_scores(study, again), "")))
     numbers += _per_class(study)
-    numbers += _every_probe(records)
     names = " or ".join(dict.fromkeys(tables.probe_name(kinds[0], score_name(found)) for found in summary.values()))
     by = study.pack.spec.group_by
     intro = f"A probe ({names}) on frozen features, scored on {tables.unseen_groups(by, records)}."
@@ -106,30 +104,6 @@ def _per_class(study: Study) -> list[Markup]:
         heads = ["class", "rows", "groups", *(f"{source}: precision / recall" for source in sources)]
         table = html.table(heads, tables.class_rows(classes, sources), label=f"{task}: classes")
         found.append(html.fold(f"Every class of {task}, by {WORDS[modality]}: precision and recall (%)", table))
-    return found
-
-
-def _every_probe(records: Sequence[dict[str, Any]]) -> list[Markup]:
-    """Every score of every record, folded: one table of classes, one of values."""
-    classes, values = [], []
-    for r in records:
-        first = [r["source"], "" if r["seed"] is None else str(r["seed"]), r["task"], r["modality"], r["probe"]]
-        mark = leak_mark(r.get("leak", ""))
-        if "targets" in r:
-            for t in r["targets"]:
-                errors = [error_text(t, key) for key in ("mae", "rmse")]
-                values.append([*first, t["name"], percent(t["r2"]) + mark, *errors])
-        else:
-            scores = (r.get(key) for key in ("accuracy", "balanced_accuracy", "macro_f1", "auroc"))
-            classes.append([*first, *("" if score is None else percent(score) + mark for score in scores)])
-    columns = ("", "seed", "task", "features", "probe")
-    found = []
-    if classes:
-        heads = (*columns, "accuracy", "balanced", "macro F1", "AUROC")
-        found.append(html.fold("Every probe with balanced accuracy, F1 and AUROC (%)", html.table(heads, classes)))
-    if values:
-        heads = (*columns, "target", "R2 %", "mean absolute error", "root mean squared error")
-        found.append(html.fold("Every probe of values with its errors", html.table(heads, values)))
     return found
 
 

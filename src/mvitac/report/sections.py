@@ -18,8 +18,8 @@ from mvitac.evaluation.score_text import WORDS, headline
 from mvitac.model import Model
 from mvitac.report import figures, tables
 from mvitac.report.figures import Line
+from mvitac.report.html import HUES, MODALITY_HUES
 from mvitac.report.html import blocks as html
-from mvitac.report.palette import HUES, MODALITY_HUES
 from mvitac.run import Run
 from mvitac.system.files import write_atomic
 
@@ -100,17 +100,15 @@ _NOT_LOSS = ("step", "lr", "pairs_per_s", "loss", "eval")
 
 
 def loss(study: Study) -> list[Markup]:
-    """The total loss of every run, the parts of each method's loss, and the learning rate."""
+    """The total loss of every run, and the parts of each method's loss."""
     series = [(r, [entry for entry in r.log if "loss" in entry]) for r in study.runs]
     series = [(r, entries) for r, entries in series if entries]
     if not series:
         return [html.paragraph("The runs left no log lines.")]
     total = [Line(r.source, *_column(entries, "loss"), study.hue(r)) for r, entries in series]
-    rates = [Line(r.source, *_column(entries, "lr"), study.hue(r)) for r, entries in series]
     drawn = [study.figure("loss", figures.curves("loss", total), "Total loss over the steps")]
     for source in study.sources:
         drawn += _loss_parts(study, source, [(r, entries) for r, entries in series if r.source == source])
-    drawn.append(study.figure("learning rate", figures.curves("learning rate", rates), "Learning rate over the steps"))
     seeds = " One line per seed." if len(study.runs) > len(study.sources) else ""
     intro = f"A falling loss alone proves nothing: read it with the next section.{seeds}"
     return [html.paragraph(intro), html.grid(drawn)]

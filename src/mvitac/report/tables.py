@@ -1,6 +1,5 @@
 """Probe results as tables for a terminal 80 columns wide, and the rows that every table of results shares."""
 
-import re
 import textwrap
 from collections.abc import Iterator, Sequence
 from typing import Any, TextIO
@@ -176,12 +175,6 @@ def print_finetuning(result: dict[str, Any], file: TextIO | None = None) -> None
         rows = [[source, *map(_score_text, found.values())] for source, found in cells.items()]
         rows += [[f"gain over {s}", *(_gain_text(ours[f], found[f]) for f in ours)] for s, found in others]
         print(text_table(f"{result['data']}: {task}", columns, rows), file=file)
-        last = [*ours][-1]  # the models that are published
-        if any(s.startswith("frozen") and paired_difference(ours[last], found[last])[2] < 0 for s, found in others):
-            advice = f"use the frozen probe of {result['ancestor']} instead"
-            if not re.match("imagenet|.*=", result["ancestor"]):  # not of a run
-                advice += ", with `mvitac publish --on PACK`"
-            print(f"{task}: fine-tuning lost against the frozen probe; {advice}", file=file)
     _print_notes(result, result["records"], file)
 
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from mvitac.bench.external.base import NOTHING, RANDOM, UNKNOWN, Adapter, Loaded, parse
+from mvitac.bench.external.adapters import NOTHING, RANDOM, UNKNOWN, Adapter, Loaded, parse
 from mvitac.system.files import brief, digest_file
 
 

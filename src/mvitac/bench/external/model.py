@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor, nn
 
-from mvitac.bench.external.base import UNKNOWN
+from mvitac.bench.external.adapters import UNKNOWN
 from mvitac.bench.external.encoder import ExternalEncoder, open_encoder
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec, Window

@@ -1,0 +1,203 @@
+"""From a text to an encoder of other people: a trunk of timm, or whatever a Python function returns.
+
+    external:timm/resnet18.a1_in1k,size=112        any model of timm: DINOv2, CLIP, ImageNet trunks, random weights
+    external:python:package.module:function        the door for all others
+
+Licences and preprocessing of timm's models are those of their ``pretrained_cfg`` (huggingface/pytorch-image-models
+@aa4b585). The Python function takes no arguments and returns a torch module and a dict:
+
+    def function():
+        return network, {"size": (224, 224), "mean": (0.5, 0.5, 0.5), "std": (0.5, 0.5, 0.5), "licence": "MIT"}
+
+The module maps normalised images to features [B, D], tokens [B, P, D] or maps [B, D, H, W]; of the last two the mean is
+taken. The dict has fields of ``Preprocessing``, and "title", "licence", "source" and "trained_on".
+"""
+
+import importlib
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from timm.data.config import resolve_data_config
+from torch import Tensor, nn
+
+from mvitac.bench.external.preprocessing import Preprocessing
+from mvitac.nn import imagenet
+from mvitac.nn.encoders import IMAGENET, SCRATCH, EncoderConfig, build_trunk
+from mvitac.nn.weights import said_trained_on
+from mvitac.registry import from_json, to_json, unknown
+from mvitac.system.files import brief
+
+START = "external:"
+UNKNOWN, NOTHING, RANDOM = "unknown", "nothing", "none (random weights)"
+ABOUT = ("title", "licence", "source", "trained_on")
+SETS = {
+    "in1k": "ImageNet-1k",
+    "in12k": "ImageNet-12k",
+    "in21k": "ImageNet-21k",
+    "in22k": "ImageNet-22k",
+    "dino": "ImageNet-1k",
+    "mae": "ImageNet-1k",
+    "openai": "OpenAI's image-text pairs",
+    "laion400m": "LAION-400M",
+    "laion2b": "LAION-2B",
+    "datacomp1b": "DataComp-1B",
+    "webli": "WebLI",
+    "lvd142m": "LVD-142M",
+    "lvd1689m": "LVD-1689M",
+}
+"""Parts of timm's tags for weights -> what they were trained on."""
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """What an adapter opened."""
+
+    network: nn.Module  # images -> features [B, D]
+    preprocessing: Preprocessing
+    title: str  # its name in tables
+    files: tuple[Path, ...] = ()  # files with its weights
+    licence: str = UNKNOWN  # licence of the weights
+    source: str = UNKNOWN  # where they are from
+    trained_on: str = UNKNOWN  # the data it was trained on; ``NOTHING`` for random weights
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adapter(ABC):
+    """Base of both adapters. The fields are the options that every encoder has; "" and None keep the adapter's value."""
+
+    place: str
+    """What to open."""
+    reads: Literal["touch", "vision", "both"] = "both"
+    """The images that it encodes."""
+    size: int | None = None
+    """Side of the input."""
+    mean: str = ""
+    """Three numbers: 0.5/0.5/0.5."""
+    std: str = ""
+    """Likewise."""
+    title: str = ""
+    """Name in tables."""
+    licence: str = ""
+    """Licence of the weights, if the adapter does not know it."""
+    trained_on: str = ""
+    """What it was trained on, if the adapter does not know it; no leak is then assumed."""
+    seed: int = 0
+    """Seed of random weights and of the probes."""
+
+    @abstractmethod
+    def load(self) -> Loaded:
+        """Open the encoder; ValueError in one line if ``place`` is something else."""
+
+    def changed(self, made: Preprocessing) -> Preprocessing:
+        """``made`` with the values that options give."""
+        changes: dict[str, Any] = {"size": (self.size, self.size)} if self.size is not None else {}
+        for name in ("mean", "std"):
+            if text := getattr(self, name):
+                try:
+                    red, green, blue = map(float, text.split("/"))
+                except ValueError:
+                    raise ValueError(f"{name} {text!r}: give 3 numbers with '/' between them") from None
+                changes[name] = red, green, blue
+        return replace(made, **changes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timm(Adapter):
+    """A model of timm."""
+
+    weights: str = "pretrained"
+    """pretrained (timm downloads them), random, or a file."""
+
+    def load(self) -> Loaded:
+        if self.place.endswith(".openai") and "quickgelu" not in self.place:
+            quick = self.place.replace("_clip_", "_clip_quickgelu_")
+            raise ValueError(f"{self.place}: OpenAI's weights need QuickGELU: {quick}")
+        known = {"pretrained": IMAGENET, "random": SCRATCH}
+        network = seeded(partial(self._built, known.get(self.weights, self.weights)), self.seed)
+        cfg: dict[str, Any] = getattr(network, "pretrained_cfg", None) or {}
+        usual = resolve_data_config(pretrained_cfg={"name": self.place, **cfg})
+        random, named, file = self.weights == "random", self.weights in known, Path(self.weights)
+        page = f"https://huggingface.co/{cfg.get('hf_hub_id')}"
+        return Loaded(
+            network,
+            Preprocessing(size=usual["input_size"][1:], mean=usual["mean"], std=usual["std"]),
+            f"{self.place}, {self.weights if named else file.name}",
+            files=() if named else (file,),
+            licence=RANDOM if random else (named and cfg.get("license")) or UNKNOWN,
+            source=imagenet.source(self.place) or page if self.weights == "pretrained" else self.weights,
+            trained_on=NOTHING if random else said(cfg.get("tag") or "") if named else said_trained_on(file) or UNKNOWN,
+        )
+
+    def _built(self, weights: str) -> nn.Module:
+        trunk = build_trunk(EncoderConfig(trunk=self.place, weights=weights), 3)
+        if self.size and hasattr(trunk, "set_input_size"):
+            try:
+                trunk.set_input_size(img_size=(self.size, self.size))  # type: ignore[operator]
+            except Exception as error:  # each model has its own rules
+                raise ValueError(f"{self.place} cannot take size {self.size} ({brief(error)})") from None
+        return trunk
+
+
+def said(tag: str) -> str:
+    """What timm's tag of pretrained weights says of their data."""
+    found = dict.fromkeys(SETS[part] for part in tag.split("_") if part in SETS)
+    return f"{', '.join(found)} (timm's tag {tag})" if found else UNKNOWN
+
+
+@dataclass(frozen=True, kw_only=True)
+class Python(Adapter):
+    """A function that returns a module and its preprocessing."""
+
+    def load(self) -> Loaded:
+        module, _, name = self.place.partition(":")
+        sys.path.insert(0, str(Path.cwd()))  # as python -m does
+        try:
+            made: Any = seeded(getattr(importlib.import_module(module), name), self.seed)
+            network, given = made[0], dict(made[1])
+        except Exception as error:  # whatever the module raises, or returns
+            why = f"{type(error).__name__}: {brief(error)}"
+            raise ValueError(f"{self.place}() returns no torch module and dict ({why}): give module:function") from None
+        finally:
+            sys.path.remove(str(Path.cwd()))
+        about: dict[str, Any] = {"title": self.place, "source": self.place}
+        about |= {name: str(given.pop(name)) for name in ABOUT if name in given}
+        if isinstance(size := given.get("size"), int):
+            given["size"] = (size, size)
+        return Loaded(Mean(network), from_json(Preprocessing, to_json(given), f"{self.place}()"), **about)
+
+
+class Mean(nn.Module):
+    """Features [B, D] of a network that gives features, tokens [B, P, D] or a map [B, D, H, W]."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, images: Tensor) -> Tensor:
+        found = self.network(images)
+        return found.mean((2, 3)) if found.ndim == 4 else found.mean(1) if found.ndim == 3 else found
+
+
+def seeded(build: Callable[[], nn.Module], seed: int) -> nn.Module:
+    """A network from ``build``, with random weights of ``seed``; the caller's random state stays as it is."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return build()
+
+
+def parse(text: str) -> Adapter:
+    """The adapter, with its options, that ``text`` names."""
+    head, *pairs = text.removeprefix(START).split(",")
+    name, _, place = head.partition("/" if head.startswith("timm/") else ":")
+    kind = {"timm": Timm, "python": Python}.get(name)
+    if not kind or not place:
+        raise unknown("encoder", text, [f"{START}timm/NAME", f"{START}python:MODULE:FUNCTION"])
+    given: dict[str, Any] = {key.replace("-", "_"): value for key, _, value in (pair.partition("=") for pair in pairs)}
+    numbers = {key: int(given[key]) for key in ("size", "seed") if given.get(key, "").isdecimal()}
+    return from_json(kind, {**given, **numbers, "place": place}, START + name)
