@@ -209,9 +209,7 @@ def test_command(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "gives 1 numbers" in capsys.readouterr().err
     for code, says in (
         ("return [np.nan, 0]", "gives [nan 0.] in step 0 of episode 1"),
-        ("raise KeyError('gel')", "fails (KeyError: 'gel') in step 0"),
         ("sys.exit(0)", "fails (SystemExit: 0)"),
-        ("return None", "gives [nan]"),
     ):
         file.write_text(f"import sys, numpy as np\ndef policy(o):\n    {code}\n")
         assert main(["ablate", f"{file}:policy", "--data", str(pack.path)]) == 2

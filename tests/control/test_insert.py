@@ -1,23 +1,17 @@
 """Inserting a peg needs both senses, the camera never shows the peg, and rows score what they say."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
-from mvitac.bench.encoder import About
-from mvitac.bench.result import VOLATILE
-from mvitac.control import result
 from mvitac.control.insert import Insert, Insertion
 from mvitac.control.learn import ridge
 from mvitac.control.result import find_suite
 from mvitac.control.suite import Row, score
-from mvitac.system.files import digest
 
 RANDOM = "external:timm/test_resnet,weights=random,size=32,seed={}"
 WHOLE: Any = find_suite("insert-v1")
@@ -116,22 +110,18 @@ def test_gymnasium_environment() -> None:
     assert total == 1 and seen["vision"].shape == seen["touch"].shape and mvitac.control.env.LoopEnv
 
 
-def test_a_result_holds_until_it_is_changed(small: Insert, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(result, "find_suite", lambda _: small)
-    monkeypatch.setattr(result, "shipped", lambda: [small.name])
-    path = result.run_suite([RANDOM.format(5)], small, tmp_path, About(name="five"))
-    _, value = result.read_control(path)
-    found = result.scores([value])
-    assert all(found["expert"]["both", "5"][0]["success"])
-    assert ("vision", "3") not in found["touch shuffled"]
-    assert found["touch shuffled"]["touch", "5"][0]["mm"] != found["five"]["touch", "5"][0]["mm"]
-    assert "100 [100" not in result._cell(small, found, "expert", ("both", "5"))  # 3 of 3 say little
-    cell = value["rows"][0]["cells"][0]
-    cell["success"][0], cell["mm"][0] = 1.0, 1.5
-    value["digest"] = digest({key: part for key, part in value.items() if key not in VOLATILE})
-    path.write_text(json.dumps(value))
-    with pytest.raises(ValueError, match="no episodes give"):
-        result.read_control(path)
+def test_a_result_that_no_episodes_give_is_refused(small: Insert) -> None:
+    """Cells that a row has, and sums of three episodes: success, mm, degrees."""
+    assert ("vision", "3") not in small.cells("touch shuffled") and len(small.cells("expert")) == 2
+    one = np.ones(3)
+    good = np.array([[1.0, 1.0, 0.0], [0.4, 1.0, 9.0], [0.1, 3.0, 2.0]])
+    assert not small.impossible("both", one, good)
+    for place, value in (((0, 0), 0.5), ((1, 0), 1.5), ((2, 1), 3.1), ((1, 2), -1.0)):
+        bad = good.copy()
+        bad[place] = value
+        assert small.impossible("both", one, bad)
+    cell = {"success": [1.0] * 3, "n": [1.0] * 3, "mm": [0.1] * 3, "deg": [0.1] * 3, "seed": None}
+    assert "100 [100" not in small.text([cell])  # 3 of 3 say little
 
 
 def test_regression_finds_what_pictures_show(small: Insert) -> None:

@@ -246,19 +246,3 @@ def test_latency_hurts(small: Servo) -> None:
     late = replace(long, conditions=(Condition(name="a", latency_ms=150),))
     mm = [np.mean(score(each, Row("true pose", None, None))[2]["mm"]) for each in (long, late)]
     assert mm[1] > 1.5 * mm[0]
-
-
-def test_gymnasium_environment() -> None:
-    gymnasium = pytest.importorskip("gymnasium")
-    from gymnasium.utils.env_checker import check_env
-
-    import mvitac.control.env
-
-    env = gymnasium.make("mvitac/Servo-v1", task="curved", condition="100 ms").unwrapped
-    check_env(env, skip_render_check=True)
-    _, info = env.reset(seed=1)
-    over = False
-    while not over:  # a policy that cheats
-        seen, reward, over, _, info = env.step((-0.5 * info["known"] / (0.2 * Edge.limit)).astype(np.float32))
-    assert info["mm"] < 0.5 and -0.5 < reward < 0
-    assert np.array_equal(seen["touch"], env.render()) and mvitac.control.env.LoopEnv

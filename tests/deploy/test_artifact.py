@@ -1,13 +1,10 @@
 """What is published is what is loaded; anything else in its place is refused before it can do harm."""
 
-import shutil
 from copy import copy as copied
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -16,11 +13,9 @@ from mvitac.data.images import difference
 from mvitac.data.pack import Pack
 from mvitac.deploy.artifact import ARTIFACT, preprocessing
 from mvitac.deploy.card import card
-from mvitac.deploy.publish import fit_probes
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
-from mvitac.evaluation.features import fitting, pack_features
+from mvitac.evaluation.features import fitting
 from mvitac.evaluation.probe import split_rows
-from mvitac.system.files import digest_file
 
 
 def test_predicts_what_the_probe_scored(smoke_run: Path, artifact: Path, pack: Pack) -> None:
@@ -40,19 +35,6 @@ def test_predicts_what_the_probe_scored(smoke_run: Path, artifact: Path, pack: P
     images = pack.images["touch"][:5]
     assert torch.equal(model.embed(touch=images)["touch"], mvitac.load(smoke_run).embed(touch=images)["touch"])
     assert not any(module.training for module in model.modules())
-
-
-def test_a_probe_gives_scikit_learns_probabilities(smoke_run: Path, pack: Pack) -> None:
-    from mvitac.evaluation.classifiers import fit_linear
-
-    model = mvitac.load(smoke_run)
-    for task in pack.spec.tasks:  # one of three classes, one of two
-        rows = split_rows(pack, task)
-        labels = pack.column(f"label_{task.name}").astype(int)
-        x = {r: pack_features(model, pack, "touch", getattr(rows, r)).numpy() for r in ("train", "val", "test")}
-        fitted, _ = fit_linear(x["train"], labels[rows.train], x["val"], labels[rows.val])
-        probe = fit_probes(model, pack)[f"{task.name}.touch"]
-        np.testing.assert_allclose(probe(torch.from_numpy(x["test"])).numpy(), fitted(x["test"]), atol=1e-4)
 
 
 def test_the_card_names_what_encoders_and_what_probes_learned_from(artifact: Path) -> None:
@@ -104,40 +86,17 @@ def test_the_hub_offline_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.M
         mvitac.load("runs/frist")
 
 
-def test_the_hub_mixin_takes_the_artifact_there_and_back(
-    artifact: Path, tmp_path: Path, pack: Pack, monkeypatch: pytest.MonkeyPatch
+def test_a_download_is_an_artifact_and_no_other_file_is_asked_for(
+    artifact: Path, copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import huggingface_hub
-    from huggingface_hub import hub_mixin
 
-    hub, asked = tmp_path / "hub", {}
-
-    def create_repo(repo_id: str, **options: Any) -> Any:
-        asked.update(options)
-        return SimpleNamespace(repo_id=repo_id)
-
-    def upload_folder(*, repo_id: str, folder_path: Path, **options: Any) -> str:
-        shutil.copytree(folder_path, hub / repo_id)
-        return f"somewhere/{repo_id}"
-
-    api = SimpleNamespace(create_repo=create_repo, upload_folder=upload_folder)
-    monkeypatch.setattr(hub_mixin, "HfApi", lambda token=None: api)
-    download = lambda repo, **options: asked.update(options) or str(hub / repo)  # noqa: E731
+    asked: dict[str, Any] = {}
+    download = lambda repo, **options: asked.update(options, repo=repo) or str(copy)  # noqa: E731
     monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
-    assert mvitac.load(artifact).push_to_hub("someone/touch", private=True) == "somewhere/someone/touch"  # type: ignore[operator]
-    assert asked["private"]
-    files = {path.name: digest_file(path) for path in (hub / "someone/touch").iterdir()}
-    assert files == {path.name: digest_file(path) for path in artifact.iterdir()}
-
-    model = mvitac.PublishedModel.from_pretrained("someone/touch", revision="v2", local_files_only=True)
-    assert asked["revision"] == "v2" and asked["local_files_only"]
-    images = pack.images["touch"][:5]
-    assert torch.equal(model.embed(touch=images)["touch"], mvitac.load(artifact).embed(touch=images)["touch"])
-    assert mvitac.load("someone/touch@v3").classes == model.classes and asked["revision"] == "v3"
-    assert set(asked["allow_patterns"]) == files.keys()
-    model.save_pretrained(tmp_path / "again")
-    assert mvitac.PublishedModel.from_pretrained(tmp_path / "again").classes == model.classes
-    (hub / "someone/touch/run.json").write_text("{}")
-    for load in (model.from_pretrained, mvitac.load):
-        with pytest.raises(ValueError, match="does not match its digest"):
-            load("someone/touch")
+    assert mvitac.load("someone/touch@v3").classes == mvitac.load(artifact).classes
+    assert (asked["repo"], asked["revision"]) == ("someone/touch", "v3")
+    assert set(asked["allow_patterns"]) == {path.name for path in artifact.iterdir()}
+    (copy / "run.json").write_text("{}")
+    with pytest.raises(ValueError, match="does not match its digest"):
+        mvitac.load("someone/touch")

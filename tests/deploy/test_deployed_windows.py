@@ -64,8 +64,8 @@ def test_other_than_clips_are_refused(model: Model) -> None:
             model.embed(touch=given)
 
 
-def test_each_frame_is_minus_the_first_one_of_its_touch(model: Model, measured: Pack) -> None:
-    other = mvitac.load(model.folder)  # type: ignore[attr-defined]
+def test_each_frame_is_minus_the_first_one_of_its_touch(published: Path, model: Model, measured: Pack) -> None:
+    other = mvitac.load(published)
     other.spec = replace(other.spec, window=replace(other.spec.window, minus_first=True))
     touch = measured.images["touch"]
     clip, first = np.stack([touch[0], touch[3]]), touch[6]

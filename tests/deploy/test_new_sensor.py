@@ -19,7 +19,6 @@ from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import Materials, MaterialsConfig
 from mvitac.deploy.engine import Engine, about_sensor
 from mvitac.deploy.publish import with_probes
-from mvitac.evaluation.probe import probe_model
 from mvitac.evaluation.sensors import (
     RecolouredPack,
     learn_looks,
@@ -141,23 +140,6 @@ def test_live_answers_as_the_probe_in_known_colours(engine: Engine, model: Model
     assert np.abs(plain["rough"] - expected["rough"]).max() > 0.02
 
 
-def test_scores_of_the_export_are_those_of_the_probe(engine: Engine, model: Model, old: Pack, new: Pack) -> None:
-    both = RecolouredPack(old, new)
-    records = probe_model(model, both, both.spec.tasks, ("both",), ("linear",), ("colours",))
-    expected = {record["task"]: 100 * record["accuracy"] for record in records}
-    found = {task: scores["export"] for task, scores in engine.meta["report"]["accuracy"].items()}
-    assert found == pytest.approx(expected) and len(found) == 3
-    shown = {"sensor": "slim", "in_colours_of": ["digit", "mini"], "num_images": 80}
-    assert engine.new_sensor is not None and {**engine.new_sensor, "in_colours_of": ["digit", "mini"]} == shown
-
-
-def test_both_engines_show_the_same(engine: Engine, new: Pack) -> None:
-    images = {m: new.images[m][:4] for m in engine.inputs}
-    other = Engine(engine.folder, engine="onnxruntime")(**images)
-    for name, values in engine(**images).items():
-        np.testing.assert_allclose(other[name], values, atol=2e-3)
-
-
 def test_a_recording_gives_one_image_of_each_touch(engine: Engine, old: Pack, new: Pack, tmp_path: Path) -> None:
     """Frames of one touch are near-copies: they would make the sign look sure. The colours are those of the images."""
     rows = unlabelled_rows(new, 0, 400)
@@ -180,8 +162,8 @@ def test_live_says_which_sensor_is_new(engine: Engine) -> None:
         return about_sensor(SimpleNamespace(**{**given, **about}), name)
 
     assert "slim is new to the model, which knows digit, mini: nothing is done" in said("slim")
-    assert said("slim", sensors=[]).endswith("slim may be new to it") and "met the touch sensors digit" in said("")
-    assert said("mini") == said("", sensors=[]) == said("slim", inputs={"vision": (32, 32, 3)}) == ""
+    assert "which knows none by name" in said("slim", sensors=[])
+    assert said("mini") == said("") == said("slim", inputs={"vision": (32, 32, 3)}) == ""
     for name in ("", "slim"):
         assert "slim is new to the model: it is shown in the colours of" in about_sensor(engine, name)
     assert "export the model again for mini" in about_sensor(engine, "mini")

@@ -1,6 +1,5 @@
 """The encoders inside a policy."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -36,14 +35,6 @@ def test_features_are_the_models(model: Model, pack: Pack) -> None:
     maps = encoder.maps(history)["touch"]  # this trunk's features are the mean over places
     assert maps.ndim == 5 and not maps.requires_grad
     torch.testing.assert_close(maps.mean((-2, -1))[0], expected["touch"], atol=1e-4, rtol=1e-4)
-
-
-def test_images_are_seen_at_the_side_the_model_predicts_at(model: Model, pack: Pack) -> None:
-    """Which may be larger than that of the views it was trained on."""
-    model.run = replace(model.run, augment=replace(model.run.augment, size=24, whole=32))
-    expected = model.embed(touch=pack.images["touch"][:4])["touch"]
-    found = ObservationEncoder(model, {"gel": "touch"})({"gel": observe(pack, [0, 1, 2, 3])["observation.images.gel"]})
-    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
 
 
 def test_a_policy_trains_its_head_and_leaves_the_encoders_alone(model: Model, pack: Pack) -> None:

@@ -56,31 +56,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run"
 
 
-def test_what_is_lifted() -> None:
-    """The first that convinces; if none does, the most promising of those tried."""
-    p = np.array([[0.6, 0.9, 0.1], [0.2, 0.5, 0.9], [0.1, 0.4, 0.3]])
-    lifted, tried = regrasp.decide(p)
-    assert lifted.tolist() == [0, 1, 1] and tried.tolist() == [1, 2, 3]
-    lifted, tried = regrasp.decide(p, regrasp.NEVER)
-    assert lifted.tolist() == [1, 2, 1] and tried.tolist() == [3, 3, 3]
-    y, objects = np.array([0, 1, 1, 0, 0, 0]), np.array([0, 0, 1, 1, 2, 2])
-    hands = np.array([[0, 1], [2, 3], [4, 5]])  # lifts are counted by object
-    found = regrasp.play(y.astype(float), y, objects, hands, 0.5)
-    assert found == {"group_sizes": [1, 1, 1], "group_correct": [1, 1, 0], "tried": 5 / 3}
-    assert regrasp.play(np.ones(6), y, objects, hands, 0.5)["group_correct"] == [0, 1, 0]
-
-
-def test_hands_are_of_one_object_and_use_no_grasp_twice() -> None:
-    objects = np.array([0] * 7 + [1] * 4 + [2] * 3)
-    hands = regrasp.episodes(objects, 3, seed=0)
-    assert hands.shape == (4, 3) and len(set(hands.ravel())) == 12
-    assert (objects[hands] == objects[hands[:, :1]]).all()
-    assert np.array_equal(hands, regrasp.episodes(objects, 3, 0))
-    assert not np.array_equal(hands, regrasp.episodes(objects, 3, 1))
-    with pytest.raises(ValueError, match="an object has 3 grasps, fewer than 4 candidates"):
-        regrasp.episodes(objects, 4, 0)
-
-
 def test_touch_that_knows_the_outcome_lifts_like_the_oracle(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

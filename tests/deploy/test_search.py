@@ -1,19 +1,13 @@
 """Search is exact and finds pairs in both directions; the encoders as a scikit-learn transformer."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 from sklearn.base import clone
-from sklearn.linear_model import LogisticRegression
-from sklearn.model_selection import GroupKFold, cross_val_score
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
 
 import mvitac
 from mvitac import ImageFeatures
@@ -89,38 +83,6 @@ def test_find_command_draws_what_it_found(
         assert any(picture[80].tobytes() in line.tobytes() for line in pixels)
 
 
-def test_find_subtracts_the_background(
-    known: Path,
-    artifact: Path,
-    pack: Pack,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A touch that minus its background is row 11 finds row 11 when both files are given."""
-    row = pack.images["touch"][11].astype(int)
-    free = np.where(row < 128, 255, 0).astype(np.uint8)  # so that 2 (row - 128) + free fits into a byte
-    raw = 2 * (row - 128) + free
-    Image.fromarray(raw.astype(np.uint8)).save(tmp_path / "raw.png")
-    Image.fromarray(free).save(tmp_path / "free.png")
-    command = ["find", str(tmp_path / "raw.png"), "--model", str(artifact), "--known", str(known)]
-    command += ["--to", "touch", "--num", "1"]
-    background = ["--background", str(tmp_path / "free.png")]
-    load = mvitac.load
-
-    def minus(path: Any) -> Model:
-        model = load(path)
-        model.spec = replace(model.spec, difference=True)
-        return model
-
-    monkeypatch.setattr("mvitac.deploy.artifact.load", minus)
-    assert main([*command, *background]) == 0
-    shown = capsys.readouterr().out
-    assert "1.000" in shown and pack.column("id")[11] in shown
-    assert main(command) == 0
-    assert "1.000" not in capsys.readouterr().out
-
-
 def test_a_changed_file_or_another_models_is_refused(known: Path, tmp_path: Path, model: Model) -> None:
     data = bytearray(known.read_bytes())
     data[len(data) // 2] ^= 1
@@ -158,15 +120,6 @@ def files(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> dict[str, lis
         for row, name in enumerate(names):
             Image.fromarray(pack.images[modality][row]).save(name)
     return paths
-
-
-def test_a_pipeline_learns_from_paths(smoke_run: Path, pack: Pack, files: dict[str, list[Path]]) -> None:
-    labels = pack.column("label_bright")[:NUM]
-    pipeline = make_pipeline(ImageFeatures(smoke_run), StandardScaler(), LogisticRegression(max_iter=1000))
-    split = {"cv": GroupKFold(3), "groups": pack.column("group")[:NUM]}
-    assert cross_val_score(pipeline, files["touch"], labels, **split).mean() > 0.75  # chance is .5
-    fitted = clone(pipeline).fit(files["touch"], labels)
-    assert (fitted.predict(np.array([str(f) for f in files["touch"]])) == labels).mean() > 0.9
 
 
 def test_features_are_the_models(smoke_run: Path, pack: Pack, files: dict[str, list[Path]]) -> None:

@@ -85,16 +85,14 @@ def export(argv: list[str]) -> None:
 
 
 def _rows(report: dict[str, Any]) -> list[list[str]]:
-    rows = []
-    for task, values in report["accuracy"].items():
-        rows.append([f"{task}, accuracy %", f"{values['original']:.1f}", f"{values['export']:.1f}"])
+    rows = [
+        [f"{t}, accuracy %", *(f"{v[k]:.1f}" for k in ("original", "export"))] for t, v in report["accuracy"].items()
+    ]
     for target in (target for targets in report["values"].values() for target in targets):
         if target["num"]:
             cells = (f"{target[key]:.3g}" for key in ("original", "export"))
             rows.append([f"{target['name']}, mean absolute error, {target['unit']}", *cells])
         rows.append([f"{target['name']}, change, {target['unit']}", "", f"{target['change']:.2g}"])
-    for name, values in report["cosine"].items():
-        rows.append([f"{name}, lowest cosine", "", f"{values['min']:.5f}"])
-    rows.append(["size, MB", "", f"{report['size_mb']}"])
-    rows.append(["latency of one pair, ms: p50 / p99", "", "{p50} / {p99}".format(**report["latency_ms"])])
-    return rows
+    rows += [[f"{name}, lowest cosine", "", f"{values['min']:.5f}"] for name, values in report["cosine"].items()]
+    latency = "{p50} / {p99}".format(**report["latency_ms"])
+    return [*rows, ["size, MB", "", f"{report['size_mb']}"], ["latency of one pair, ms: p50 / p99", "", latency]]

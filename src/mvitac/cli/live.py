@@ -4,8 +4,8 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -92,7 +92,7 @@ def live(argv: list[str]) -> None:
     loop, recorder = Live(engine, streams, options.live, **more), None
     if options.record:  # last, for a refusal must leave no spool
         loop.record = recorder = Recorder(options.record, sensor=sensor, tell=_say)
-    _run(loop, options.seconds, lambda said: print(json.dumps(said), flush=True))
+    _run(loop, options.seconds)
     _say(f"summary: {json.dumps(loop.summary())}")
     if options.json:
         write_json(options.json, loop.summary())
@@ -101,38 +101,33 @@ def live(argv: list[str]) -> None:
         _say(f"recorded: {options.record}, {num} pairs" if num else "nothing was recorded")
 
 
-def _streams(options: _Options, engine: Engine) -> dict[str, list[Any]]:
+def _streams(options: _Options, engine: Engine) -> dict[str, list[Stream]]:
     """The streams by modality, not yet open; several of one modality are numbered from 1."""
-    streams = {}
-    for modality, texts in sources(frame_shapes(engine), options.vision, options.touch).items():
-        names = [modality] if len(texts) == 1 else [f"{modality} {i + 1}" for i in range(len(texts))]
-        found = [source(text, modality) for text in texts]
-        pairs = zip(names, found, strict=True)
-        streams[modality] = [Stream(name, origin, stale_after=options.stale) for name, origin in pairs]
-    return streams
+    given = sources(frame_shapes(engine), options.vision, options.touch)
+    return {
+        m: [
+            Stream(m if len(texts) == 1 else f"{m} {i}", source(text, m), stale_after=options.stale)
+            for i, text in enumerate(texts, 1)
+        ]
+        for m, texts in given.items()
+    }
 
 
-def _run(loop: Live, seconds: float | None, write: Callable[[Any], object]) -> None:
-    """Predict until all streams ended, ``seconds`` are over, or Ctrl-C; ``write`` gets every prediction and release."""
-    start = loop.clock()
-    with _capture(loop) as news:
-        while loop.clock() - start < (seconds or float("inf")) and not all(s.ended for s in loop.all):
-            news.wait(0.05)
-            news.clear()
-            if said := loop.step():
-                write({"time": round(loop.clock() - start, 4), **said})
-    loop.finish()
+def _run(loop: Live, seconds: float | None) -> None:
+    """Print every prediction and release until all streams ended, ``seconds`` are over, or Ctrl-C.
 
-
-@contextmanager
-def _capture(loop: Live) -> Iterator[threading.Event]:
-    """Read every stream in a thread of its own; the event is set by each new frame. Ctrl-C ends the ``with``."""
-    news = threading.Event()
+    Every stream is read in a thread of its own.
+    """
+    start, news = loop.clock(), threading.Event()
     threads = [CaptureThread(stream, news.set) for stream in loop.all]
     for thread in threads:
         thread.start()
     try:
-        yield news
+        while loop.clock() - start < (seconds or float("inf")) and not all(s.ended for s in loop.all):
+            news.wait(0.05)
+            news.clear()
+            if said := loop.step():
+                print(json.dumps({"time": round(loop.clock() - start, 4), **said}), flush=True)
     except KeyboardInterrupt:
         _say("stopped")
     finally:
@@ -140,6 +135,7 @@ def _capture(loop: Live) -> Iterator[threading.Event]:
             thread.stopping.set()
         for thread in threads:
             thread.join(2.0)  # a device that hangs must not hang us
+    loop.finish()
 
 
 @dataclass(frozen=True, kw_only=True)

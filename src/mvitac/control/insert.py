@@ -20,11 +20,10 @@ import mujoco
 import numpy as np
 
 from mvitac.control.learn import Lesson
-from mvitac.control.servo import FIELD_MM, SIZE, Copy, Shape, draw_shape, textured, textures
+from mvitac.control.servo import SIZE, Copy, Shape, draw_shape, textured, textures
 from mvitac.control.suite import SHUFFLED, Cell, LoopSuite
 from mvitac.evaluation.intervals import interval
 from mvitac.sim.camera import cast, rays_of
-from mvitac.sim.coordinates import grid
 
 LENGTH_M, DEPTH_M, CLEAR_M = 0.024, 0.010, 0.0012  # of the peg below the hand; of the insertion; beside the peg
 ABOVE_M, ALIGN, DOWN, SUBSTEPS = 0.016, 9, 9, 40  # height at the start; steps above the slot and down; steps of 2 ms
@@ -119,8 +118,8 @@ class Insertion:
 def touch_of(key: tuple[int, int, int]) -> np.ndarray:
     """What the gel of an episode shows: the grasp does not change, so neither does its picture."""
     (peg, _), (_, copy) = draw_peg(key[0], key[2], bool(key[1])), _held(key[0])
-    x, y, _ = grid(SIZE, FIELD_MM)
-    return copy.press(DEPTH_MM + peg.height(x, y) + textured(peg, x, y), np.random.default_rng([_TAG, *key, 1]))
+    rng = np.random.default_rng([_TAG, *key, 1])
+    return copy.press(lambda x, y: DEPTH_MM + peg.height(x, y) + textured(peg, x, y), rng)
 
 
 def _scene(peg: Peg, slot_mm: float) -> str:

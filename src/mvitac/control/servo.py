@@ -10,8 +10,9 @@ The gel is pressed by position, not by force, and the object is rigid. Its dome,
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -188,15 +189,10 @@ class Copy:
         self.gain = float(np.exp(rng.uniform(*np.log((0.5, 1.2)))))
         self.sensor, self.unit = replace(sensor, noise=sensor.noise * noise), int(rng.integers(2**31))
 
-    def touch(self, shape: Shape, state: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """What it sees of a shape: uint8 [64, 64, 3]."""
-        x, y, _ = grid(SIZE, FIELD_MM)
-        return self.press(task_of(shape.kind).indent(shape, state, x, y), rng)
-
-    def press(self, height_mm: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """What it sees of heights above the apex of its gel, [128, 128] in mm."""
+    def press(self, height_mm: Callable[[np.ndarray, np.ndarray], np.ndarray], rng: np.random.Generator) -> np.ndarray:
+        """What it sees, uint8 [64, 64, 3], of heights in mm above the apex of its gel, by place in mm."""
         x, y, pixel = grid(SIZE, FIELD_MM)
-        indent = height_mm - (x * x + y * y) / (2 * DOME_MM)
+        indent = height_mm(x, y) - (x * x + y * y) / (2 * DOME_MM)
         imprint = gel.relax(np.clip(indent, 0, 2.5).astype(np.float32), pixel_mm=pixel)
         return gel.render(imprint, self.sensor, rng, pixel_mm=pixel, size=SIZE, unit=self.unit, gain=self.gain)
 
@@ -217,7 +213,7 @@ def presses(name: str, seed: int, each: int, number: int) -> tuple[np.ndarray, n
         along = float(rng.uniform(-6, 25))
         asked = task.target + rng.uniform(-1, 1, len(task.target)) * task.reach
         state = _near(task, shape, asked, along)
-        images.append(Copy(rng, new=False).touch(shape, state, rng))
+        images.append(Copy(rng, new=False).press(partial(task.indent, shape, state), rng))
         poses.append(task.pose(shape, state))
     return np.stack(images), np.stack(poses)
 
@@ -245,4 +241,5 @@ def picture(asked: tuple[str, tuple[int, ...], bool, float, np.ndarray, int]) ->
     """What the sensor of an episode sees at a step: of kind, key, whether it is new, its noise, state and step."""
     kind, key, new, noise, state, step = asked
     sensor = Copy(np.random.default_rng([_TOUCH, *key]), new=new, noise=noise)
-    return sensor.touch(begun(kind, key)[0], state, np.random.default_rng([_TOUCH, *key, 1 + step]))
+    height = partial(task_of(kind).indent, begun(kind, key)[0], state)
+    return sensor.press(height, np.random.default_rng([_TOUCH, *key, 1 + step]))

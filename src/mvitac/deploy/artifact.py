@@ -11,12 +11,8 @@ against its digest before it is parsed, and no file with another name is opened.
 """
 
 import re
-import shutil
 from pathlib import Path
 from typing import Any
-
-from huggingface_hub import ModelHubMixin
-from torch import nn
 
 from mvitac import model as models
 from mvitac.deploy.sealed_folder import SealedFolder
@@ -49,37 +45,6 @@ LAYOUT = (
 HUB_ID = re.compile(r"(?P<repo>[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)(@(?P<revision>[\w./-]+))?")
 
 
-class PublishedModel(Model, ModelHubMixin):
-    """A model from an artifact, with the Hub's usual ``from_pretrained``, ``save_pretrained`` and ``push_to_hub``.
-
-    An upload copies the artifact file by file; a download is checked like a local artifact.
-    """
-
-    def __init__(self, model: Model, folder: Path) -> None:
-        nn.Module.__init__(self)
-        self.__dict__.update(vars(model))
-        self.folder = folder
-        self._hub_mixin_config = None  # run.json and artifact.json hold all of it: no config.json
-
-    @classmethod
-    def from_pretrained(
-        cls, pretrained_model_name_or_path: str | Path, *, revision: str | None = None, **options: Any
-    ) -> "PublishedModel":
-        """The artifact in a folder, or of "owner/name" on the Hub.
-
-        Args:
-            pretrained_model_name_or_path: folder or Hub id.
-            revision: branch, tag or commit on the Hub.
-            options: those of ``huggingface_hub.snapshot_download`` (token, cache_dir, local_files_only, force_download).
-        """
-        local = Path(pretrained_model_name_or_path)
-        return read(local if local.is_dir() else pull(str(pretrained_model_name_or_path), revision, **options))
-
-    def _save_pretrained(self, save_directory: Path) -> None:
-        for name in (ARTIFACT.name, *ARTIFACT.read(self.folder)["files"]):
-            shutil.copyfile(self.folder / name, save_directory / name)
-
-
 def load(path: str | Path, which: models.Which = "last") -> Model:
     """Load a trained model, in eval mode; from an artifact with its probes (``Model.predict``).
 
@@ -107,13 +72,13 @@ def load(path: str | Path, which: models.Which = "last") -> Model:
     return read(local) if (local / ARTIFACT.name).is_file() else models.load(local, which)
 
 
-def pull(repo: str, revision: str | None = None, **options: Any) -> Path:
+def pull(repo: str, revision: str | None) -> Path:
     """Download the artifact ``repo`` into the local cache of the Hub; only files that an artifact may have are fetched."""
     from huggingface_hub import snapshot_download
 
     allowed = sorted({ARTIFACT.name, *ARTIFACT.required, *ARTIFACT.optional})
     try:
-        return Path(snapshot_download(repo, revision=revision, allow_patterns=allowed, **options))
+        return Path(snapshot_download(repo, revision=revision, allow_patterns=allowed))
     except Exception as error:  # offline, not found, no access: the client has an exception for each
         raise ValueError(f"no folder {repo} here, and no download from the Hugging Face Hub: {brief(error)}") from None
 
@@ -136,7 +101,7 @@ def preprocessing(model: Model) -> dict[str, Any]:
     }
 
 
-def read(folder: Path) -> PublishedModel:
+def read(folder: Path) -> Model:
     """The model in the artifact ``folder``, with its probes; ValueError if anything was changed since it was published."""
     about = ARTIFACT.read(folder)
     model = models.load(folder / "model.safetensors")
@@ -155,4 +120,4 @@ def read(folder: Path) -> PublishedModel:
             if reads != dim:
                 raise ValueError(f"{path}: probe {info.name} reads {reads} features, the model gives {dim}")
             model.probes[info.name] = probe
-    return PublishedModel(model, folder).eval()
+    return model.eval()

@@ -120,19 +120,15 @@ class Engine:
 def about_sensor(engine: Any, name: str) -> str:
     """A sentence on touch sensor ``name`` ("" = not known), if it is new to the model of ``engine``; else ""."""
     known, new = engine.sensors, engine.new_sensor
-    if "touch" not in engine.inputs:
-        return ""
     if new and name not in ("", new["sensor"]):
         return f"this export is for touch sensor {new['sensor']}: export the model again for {name}, --new-sensor"
     if new:
         colours = f"{listed(new['in_colours_of'])} ({new['num_images']} unlabelled images)"
         return f"touch sensor {new['sensor']} is new to the model: it is shown in the colours of {colours}"
-    if not known:
-        return f"nothing says which touch sensors the model met: {name} may be new to it" if name else ""
-    if not name:
-        return f"the model met the touch sensors {listed(known)}: --sensor NAME says if another is used"
+    if not name or name in known or "touch" not in engine.inputs:
+        return ""
     how = "nothing is done about it (`mvitac export MODEL --new-sensor RECORDING` shows it in their colours)"
-    return "" if name in known else f"touch sensor {name} is new to the model, which knows {listed(known)}: {how}"
+    return f"touch sensor {name} is new to the model, which knows {listed(known) or 'none by name'}: {how}"
 
 
 def frames_of(window: Mapping[str, Any] | None, modality: str) -> int:

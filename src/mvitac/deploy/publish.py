@@ -134,10 +134,10 @@ def own_data(model: Model, instead: str, *, few: bool = False) -> Pack:
         raise ValueError(f"the data this model was trained on is not here ({brief(error)}): {instead}") from None
 
 
-def with_probes(model: Model, pack: Pack | None = None) -> Model:
-    """``model`` with probes: its own if it has some (an artifact), else fitted on ``pack`` (default: the run's data)."""
+def with_probes(model: Model, pack: Pack) -> Model:
+    """``model`` with probes: its own if it has some (an artifact), else fitted on ``pack``."""
     if not model.probes:
-        model.probes = fit_probes(model, as_trained(model, pack) if pack else model.open_data())
+        model.probes = fit_probes(model, as_trained(model, pack))
     return model
 
 
@@ -179,20 +179,17 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
         write_json(partial / "run.json", record, sealed=True)
         if learned is not None:
             write_sources(partial, learned)
-        about = {**_describe(model, pack), "start": record.get("start"), "scores": scores}
+        keys, infos = ("name", "licence", "source"), [r.info for r in model.probes.values()]
+        about = {
+            "preprocessing": preprocessing(model),
+            "probes": [to_json(q) for q in infos if isinstance(q, ProbeInfo)],
+            "values": [to_json(q) for q in infos if isinstance(q, ValueInfo)],
+            "data": {**{key: getattr(pack.spec, key) for key in keys}, "digest": pack.digest},
+            "trained_on": {key: getattr(model.spec, key) for key in keys},
+            "start": record.get("start"),
+            "scores": scores,
+        }
         write_atomic(partial / "README.md", lambda file: file.write(card(model, about).encode()))
         ARTIFACT.write(partial, about)
         read(partial)
     return out
-
-
-def _describe(model: Model, pack: Pack) -> dict[str, Any]:
-    keys = ("name", "licence", "source")
-    infos = [r.info for r in model.probes.values()]
-    return {
-        "preprocessing": preprocessing(model),
-        "probes": [to_json(q) for q in infos if isinstance(q, ProbeInfo)],
-        "values": [to_json(q) for q in infos if isinstance(q, ValueInfo)],
-        "data": {**{key: getattr(pack.spec, key) for key in keys}, "digest": pack.digest},
-        "trained_on": {key: getattr(model.spec, key) for key in keys},
-    }

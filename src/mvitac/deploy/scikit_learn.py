@@ -47,11 +47,7 @@ class ImageFeatures(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstim
         self.background = background
 
     def fit(self, X: Any, y: Any = None) -> "ImageFeatures":
-        """Load the model. ``X`` and ``y`` are not used.
-
-        Raises:
-            ValueError: If there is no such model, or it has no such encoder.
-        """
+        """Load the model; ValueError if there is none, or it has no such encoder. ``X`` and ``y`` are not used."""
         self.model_ = self.model if isinstance(self.model, Model) else load(self.model)
         self.names_ = ("vision", "touch") if self.modality == "both" else (self.modality,)
         for name in self.names_:
@@ -60,17 +56,9 @@ class ImageFeatures(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstim
         return self
 
     def transform(self, X: Sequence[Any] | np.ndarray) -> np.ndarray:
-        """Features of images.
+        """Features [N, D] float32 of N images of any kind that ``Model.embed`` takes; for "both" of N pairs (vision, touch).
 
-        Args:
-            X: N images of any kind that ``Model.embed`` takes; for "both" N pairs (vision, touch). A data frame of paths
-                is read by its columns "vision" and "touch".
-
-        Returns:
-            [N, D] float32.
-
-        Raises:
-            ValueError: If images do not fit the model.
+        A data frame of paths is read by its columns "vision" and "touch". ValueError if images do not fit the model.
         """
         check_is_fitted(self)
         names = self.names_

@@ -179,13 +179,11 @@ class Simulated(Source):
         if int(touch) != self.touch:
             self.touch = int(touch)
             rng = np.random.default_rng([self.seed, self.touch])
-            while True:  # all touches by one sensor, as on a robot
-                address = int(rng.integers(len(materials.CLASSES))), int(rng.integers(60)), int(rng.integers(5))
-                pair = materials.touch(self.seed, *address, size=self.size)
-                if pair["sensor"] == self.sensor:
-                    break
+            address = int(rng.integers(len(materials.CLASSES))), int(rng.integers(60)), int(rng.integers(5))
+            sensor = SENSORS[self.sensor]  # one for all touches, as on a robot
+            pair = materials.touch(self.seed, *address, size=self.size, sensors=(sensor,))
             quiet = np.zeros((self.size, self.size), np.float32)
-            blank = gel.render(quiet, SENSORS[self.sensor], rng, pixel_mm=12.8 / self.size, unit=1)
+            blank = gel.render(quiet, sensor, rng, pixel_mm=12.8 / self.size, unit=1)
             self.pictures = {"vision": (pair["vision"],) * 2, "touch": (blank, pair["touch"])}
         self.number += 1
         image = self.pictures[self.modality][phase >= self.rest].astype(np.float32)

@@ -44,14 +44,14 @@ class Contact:
         self.background: np.ndarray | None = None
         self.picture: np.ndarray | None = None
         """The background float32 [side, side, 3] at the size of the model's input."""
-        self.noise = self.level = 0.0
+        self.noise = 0.0
         self.touched = self.uneasy = False
         if self.free is not None:
             self.background = _small(self.free)
             self.picture = fit(self.free, self.side).astype(np.float32) if self.side else None
 
     def __call__(self, image: np.ndarray) -> bool | None:
-        """True in contact, False without, None while calibrating; sets ``level``, the change over the threshold."""
+        """True in contact, False without, None while calibrating."""
         small = _small(image)
         whole = fit(image, self.side) if self.side else None
         if self.background is None:
@@ -72,8 +72,7 @@ class Contact:
             self.picture = np.stack(pictures).mean(0, dtype=np.float32) if pictures else None
         change = float(np.abs(small - self.background).mean())
         threshold = max(LEAST_CHANGE, self.config.contact * self.noise)
-        self.level = change / threshold
-        self.touched = self.level > (0.5 if self.touched else 1.0)
+        self.touched = change > threshold * (0.5 if self.touched else 1.0)
         if not self.touched:
             self.background += FOLLOW * (small - self.background)
             if whole is not None and self.picture is not None:
