@@ -413,7 +413,6 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "animation": (damage_frames, "2 frames"),
     "float": (lambda path: Image.fromarray(np.ones((8, 8), np.float32)).save(path, "TIFF"), "floating-point"),
     "32 bit": (lambda path: Image.fromarray(np.full((8, 8), 70000, np.int32)).save(path, "TIFF"), "not 0 to 65535"),
-    "other size": (lambda path: Image.new("RGB", (9, 9)).save(path), "need one"),
     "gone": (lambda path: path.unlink(), "does not exist"),
 }
 

@@ -120,7 +120,7 @@ def test_frames_that_only_the_rough_lists_name_are_hidden_from_all_else() -> Non
     find_touches(listed)
     assign_official(listed, 0, 0)
     pack = object.__new__(Pack)  # the table alone
-    pack.spec = _spec(TouchAndGoConfig(split="official"), True, (), False)
+    pack.spec = _spec(TouchAndGoConfig(split="official"), (), False)
     pack.table, pack.num = pa.Table.from_pylist([_columns(frame, pack.spec) for frame in listed]), len(listed)
     split, touch = pack.column("split"), pack.column("touch_group")
     named = np.array([frame.listed for frame in listed])
@@ -327,7 +327,8 @@ def test_a_frame_without_a_label_is_left_out(tree: Path, tmp_path: Path) -> None
 def test_the_cache_knows_changed_jpegs(tmp_path: Path) -> None:
     """Another frame in place of a listed one, of whatever size."""
     for name, side in zip(NAMES[:2], ("train", "test"), strict=True):
-        (tmp_path / f"{side}.txt").write_text("\n".join(f"{name}/{i:010d}.jpg,{i % 2}" for i in range(6)))
+        for task in ("", "_rough"):
+            (tmp_path / f"{side}{task}.txt").write_text("\n".join(f"{name}/{i:010d}.jpg,{i % 2}" for i in range(6)))
     config = TouchAndGoConfig(root=tmp_path, size=16, workers=1, split="official")
     packs = []
     for level, when in ((40, 10), (200, 20)):
@@ -354,10 +355,10 @@ def test_missing_recordings_are_named_and_may_be_left_out(tree: Path, tmp_path: 
     (root / "dataset" / NAMES[5] / "video.mp4").write_bytes(b"")
     (root / "dataset" / NAMES[6]).rename(root / "dataset" / f"{NAMES[6]}_rock")
     with pytest.raises(
-        ValueError, match=r"3 of 8 listed recordings cannot be packed: no folder \(1\): 20220502"
+        ValueError, match=r"3 of 8 listed recordings cannot be packed: 20220505_120000 \(no video\.mp4\)"
     ) as told:
         TouchAndGoConfig(root=root).source()
-    assert f"no video.mp4 (2): {NAMES[4]}, {NAMES[5]}" in str(told.value)
+    assert f"{NAMES[5]} (no video.mp4), {NAMES[1]} (no folder)" in str(told.value)
     pack = packed(root, tmp_path / "pack", partial=True)
     assert set(pack.column("group")) == set(NAMES) - {NAMES[1], NAMES[4], NAMES[5]}
     assert "3 of 8 listed recordings cannot be packed" in pack.spec.notes[-1]
@@ -403,8 +404,7 @@ def test_jpegs_that_are_missing_or_cut_are_listed(tmp_path: Path) -> None:
         ("train.txt", "nonsense", "train.txt line 1 is 'nonsense': expected <recording>/<10 digits>.jpg,<label>"),
         ("train.txt", "a/0000000001.jpg,20", "train.txt line 1: label 20 is not in -1 to 19"),
         ("test.txt", f"{NAMES[0]}/0000000020.jpg,1", "0000000020.jpg is listed twice"),
-        ("test.txt", None, "has no train.txt and test.txt: they are in https://github.com"),
-        ("train_rough.txt", None, "has test_rough.txt without its counterpart"),
+        ("train_rough.txt", None, "has no train_rough.txt: the lists are in https://github.com"),
     ],
 )
 def test_bad_lists_are_told(tree: Path, tmp_path: Path, name: str, text: str | None, expected: str) -> None:
@@ -414,14 +414,6 @@ def test_bad_lists_are_told(tree: Path, tmp_path: Path, name: str, text: str | N
     with pytest.raises(ValueError, match=r"\.txt") as told:
         TouchAndGoConfig(root=tree, lists=tmp_path).source()
     assert expected in str(told.value)
-
-
-def test_label_txt_alone_serves_and_knows_no_official_split(tree: Path, tmp_path: Path) -> None:
-    (tmp_path / "label.txt").write_text("".join(f"{n}/{i:010d}.jpg,{i % 3 - 1}\n" for n in NAMES for i in range(9)))
-    spec = TouchAndGoConfig(root=tree, lists=tmp_path).source().spec()
-    assert [task.name for task in spec.tasks] == ["category", "soft"]
-    with pytest.raises(ValueError, match="which the official split needs"):
-        TouchAndGoConfig(root=tree, lists=tmp_path, split="official").source()
 
 
 # -- the whole road ---------------------------------------------------------------------------------------------------
@@ -445,7 +437,7 @@ def test_from_the_download_to_a_trained_model(tree: Path, tmp_path: Path, capsys
 @pytest.mark.skipif(not SAMPLE.is_dir(), reason="the real recordings are not here")
 def test_a_real_recording_without_its_camera_video(tmp_path: Path) -> None:
     options: dict[str, Any] = {"lists": LISTS, "split": "official", "partial": True}
-    with pytest.raises(ValueError, match=r"no video\.mp4 \(1\): 20220319_002026"):
+    with pytest.raises(ValueError, match=r"20220319_002026 \(no video\.mp4\)"):
         TouchAndGoConfig(root=SAMPLE, **options).source()
     pack = packed(SAMPLE, tmp_path / "pack", modalities="touch", **options)
     assert pack.num == 76 and set(pack.column("label_category")) == {15}  # the folder's name ends in _rock

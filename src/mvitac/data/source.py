@@ -27,8 +27,6 @@ class Sample:
     touch: np.ndarray | None
     columns: dict[str, Any] = field(default_factory=dict)
     """At least id (str), group (str), split (one of SPLITS) and a label_<task> (int, -1 = none) per task."""
-    sizes: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """Modality -> original height and width, if the image has been resized."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Runs all checks on a pack, or on a source that is packed as thumbnails first."""
+"""Runs all checks on a pack, or on a source that is packed as some first."""
 
 import tempfile
 from collections.abc import Callable, Sequence
@@ -20,8 +20,8 @@ SINGLE = Window()
 Draw = Callable[[Pack, Sequence[Finding]], None]  # draws a contact sheet
 
 
-class ThumbnailSource(Source):
-    """Evenly spaced items of another source, with the original image sizes as extra columns."""
+class _Some(Source):
+    """Evenly spaced items of another source."""
 
     def __init__(self, source: Source, num: int) -> None:
         self.source = source
@@ -43,17 +43,8 @@ class ThumbnailSource(Source):
         counts = self.source.samples_per_item()
         return [counts[number] for number in self._chosen]
 
-    def read(self, item: int) -> list[Sample | Lost]:
-        samples: list[Sample | Lost] = []
-        for sample in self.source.read(self._chosen[item]):
-            if isinstance(sample, Lost):
-                samples.append(sample)
-                continue
-            given = {"vision": sample.vision, "touch": sample.touch}
-            shapes = {m: sample.sizes.get(m, i.shape[:2]) for m, i in given.items() if i is not None}
-            sizes = {f"{m}_size": f"{width} x {height}" for m, (height, width) in shapes.items()}
-            samples.append(replace(sample, columns={**sample.columns, **sizes}))
-        return samples
+    def read(self, item: int) -> Sequence[Sample | Lost]:
+        return self.source.read(self._chosen[item])
 
 
 def examine(pack: Pack, *, part: bool = False, window: Window = SINGLE) -> list[Finding]:
@@ -76,7 +67,7 @@ def examine(pack: Pack, *, part: bool = False, window: Window = SINGLE) -> list[
         image_checks.swapped_modalities(pack, looks),
         image_checks.time_offset(pack, looks),
         *([value_checks.time_shift(pack, looks)] if pack.spec.values else []),
-        table_checks.mixture(pack),
+        table_checks.sensors(pack),
         *labels,
         *table_checks.ungrouped(pack),
         *table_checks.leaks(pack),
@@ -119,12 +110,12 @@ def examine_source(
     ``num`` items are read, evenly spaced; 0 = all. Damaged items are a finding; it is an error only if nothing can be
     read.
     """
-    thumbnails = ThumbnailSource(source, num)
+    some = _Some(source, num)
     with tempfile.TemporaryDirectory(prefix="mvitac-check-") as folder:
-        pack = build(thumbnails, Path(folder) / "pack", size=size, workers=workers, max_damaged=1.0, quiet=quiet)
-        partly = len(thumbnails.items()) < len(source.items())
+        pack = build(some, Path(folder) / "pack", size=size, workers=workers, max_damaged=1.0, quiet=quiet)
+        partly = len(some.items()) < len(source.items())
         findings = examine(pack, part=partly, window=window)
-        read = f"{len(thumbnails.items())} of {len(source.items())} items examined, kept at {size} px"
+        read = f"{len(some.items())} of {len(source.items())} items examined, kept at {size} px"
         findings.insert(0, Finding("source", "ok", f"{pack.spec.name}: {read}"))
         if draw:
             draw(pack, findings)

@@ -13,7 +13,6 @@ from mvitac.data.spec import UNGROUPED, listed
 KEYS = ("object", "instance", "recording", "video", "grasp", "experiment", "session", "sequence")
 """Columns whose values should not be in more than one split either, if the dataset has them."""
 PACKED = ("label_", "has_", "crc_", "bytes_")  # what the columns that packing adds begin with
-MIX = ("sensor", "vision_size", "touch_size")  # columns that describe how an image was taken
 
 
 def unreadable(pack: Pack) -> Finding:
@@ -123,28 +122,21 @@ def ungrouped(pack: Pack) -> list[Finding]:
     return [judged("groups", "; ".join(notes), "pack again with --group COLUMN")] if notes else []
 
 
-def mixture(pack: Pack) -> Finding:
-    """Find several sensors or resolutions, and whether they alone predict a label."""
-    item, notes, wrong = "sensors and resolutions", [], []
-    for column in (name for name in MIX if name in pack.table.column_names):
-        values = pack.column(column).astype(str)
-        names, counts = np.unique(values[values != "None"], return_counts=True)  # None: rows without this image
-        order = np.argsort(-counts)
-        notes.append(f"{column}: {listed([f'{names[i]} {100 * counts[i] / pack.num:.0f} %' for i in order], 4)}")
-        if len(names) == 1:
-            continue
-        wrong += [f"several of {column}"] if column.endswith("_size") else []
-        train, test = (set(values[pack.rows(split)].tolist()) for split in ("train", "test"))
-        wrong += [f"{column} {listed(sorted(test - train), 3)} only in test"] if test - train else []
-        for task in pack.spec.tasks:
-            labels = pack.labels(task.name, "train", "val", "test")
-            counted = (labels >= 0) & (values != "None")
-            wrong += _predicts(f"{column} alone", task.name, values[counted], labels[counted])
-    if not notes:
-        lacking = "no column sensor, and a pack holds one size: check the source with --data instead"
-        return Finding(item, "not checkable", lacking)
-    advice = "probe each kind separately, or use the same kinds in train and test"
-    return judged(item, "; ".join(notes + wrong), advice, look=bool(wrong))
+def sensors(pack: Pack) -> Finding:
+    """Find sensors that are only in test, or that alone predict a label."""
+    item, names = "sensors", pack.sensor_names
+    if "sensor" not in pack.table.column_names:
+        return Finding(item, "not checkable", "no column sensor")
+    counts = np.bincount(pack.sensors, minlength=len(names))
+    found = listed([f"{names[i]} {100 * counts[i] / pack.num:.0f} %" for i in np.argsort(-counts)], 4)
+    wrong = []
+    if new := np.setdiff1d(pack.sensors[pack.rows("test")], pack.sensors[pack.rows("train")]).tolist():
+        wrong.append(f"{listed([names[i] for i in new], 3)} only in test")
+    for task in pack.spec.tasks:
+        labels = pack.labels(task.name, "train", "val", "test")
+        wrong += _predicts("sensor alone", task.name, pack.sensors[labels >= 0], labels[labels >= 0])
+    advice = "probe each sensor separately, or use the same ones in train and test"
+    return judged(item, "; ".join([found, *wrong]), advice, look=bool(wrong))
 
 
 def _predicts(what: str, task: str, values: np.ndarray, labels: np.ndarray) -> list[str]:

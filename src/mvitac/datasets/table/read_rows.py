@@ -10,8 +10,7 @@ from mvitac.data.images import difference, fit, shrink
 from mvitac.data.source import Lost, Sample
 from mvitac.datasets.table.image_refs import Damage, ImageRef, mean_image, read_all
 
-Loaded = dict[ImageRef, tuple[tuple[int, int], np.ndarray]]
-"""Reference -> original height and width of the image, and the image at the stored size."""
+Loaded = dict[ImageRef, np.ndarray]  # images at the stored size
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +69,7 @@ def read_rows(rows: Sequence[Row], size: int) -> list[Sample | Lost]:
 
 def _load(refs: Sequence[ImageRef], size: int, lost: Damage) -> Loaded:
     """Read images at the stored size (a whole video would not fit otherwise); damaged ones are put in ``lost``."""
-    return {ref: ((image.height, image.width), shrink(image, size)) for ref, image in read_all(refs, lost)}
+    return {ref: shrink(image, size) for ref, image in read_all(refs, lost)}
 
 
 def _sample(row: Row, vision: Loaded, touch: Sequence[Loaded], size: int, lost: Damage) -> Sample:
@@ -78,19 +77,8 @@ def _sample(row: Row, vision: Loaded, touch: Sequence[Loaded], size: int, lost: 
     for ref in (row.vision, *row.touch):
         if ref in lost:
             raise ValueError(lost[ref])
-    touches = [images[ref] for images, ref in zip(touch, row.touch, strict=False)]
-    if len({shape for shape, _ in touches}) > 1:
-        raise ValueError(f"{row.touch[0]} and {row.touch[1]} differ in size: stacked sensors need one")
-    pressed = [image for _, image in touches]
+    pressed = [images[ref] for images, ref in zip(touch, row.touch, strict=False)]
     for k, background in enumerate(row.background):
-        empty, shape = mean_image(background), touches[k][0]
-        if empty.shape[:2] != shape:
-            (h, w), (h2, w2) = shape, empty.shape[:2]
-            raise ValueError(f"{row.touch[k]} is {w} x {h}, its background {w2} x {h2}: a difference needs one size")
-        pressed[k] = difference(pressed[k], fit(empty, size))
-    sizes = {"touch": touches[0][0]} if touches else {}
-    image = None
-    if row.vision:
-        sizes["vision"], image = vision[row.vision]
-    stacked = np.concatenate(pressed, axis=2) if pressed else None
-    return Sample(vision=image, touch=stacked, columns=row.columns, sizes=sizes)
+        pressed[k] = difference(pressed[k], fit(mean_image(background), size))
+    image = vision[row.vision] if row.vision else None
+    return Sample(vision=image, touch=np.concatenate(pressed, axis=2) if pressed else None, columns=row.columns)

@@ -2,7 +2,6 @@
 
 train.txt  test.txt               category of 20          rows "<rec>/<10 digits>.jpg,<label>", -1 = inconclusive
 train_rough.txt  test_rough.txt   1 rough, 0 smooth
-label.txt                         every labelled frame, if the other lists are missing
 """
 
 import re
@@ -21,7 +20,7 @@ CLASSES = (
 )
 SOFT = (7, 8, 9, 11, 13)  # categories that the owners call soft; the others are hard
 AT = "https://github.com/fredfyyang/Touch-and-Go, folder 'Visuo-tactile contrastive learning/dataset'"
-LIST_FILES = ("train.txt", "test.txt", "train_rough.txt", "test_rough.txt", "label.txt")
+LIST_FILES = ("train.txt", "test.txt", "train_rough.txt", "test_rough.txt")
 ROW = re.compile(r"^[ \t]*([^/,\s]+)/(\d{10})\.jpg,(-?\d{1,9})[ \t]*$", re.MULTILINE)
 
 
@@ -60,18 +59,12 @@ def read_list(file: Path, num_classes: int) -> list[tuple[str, int, int]]:
 
 
 def read_lists(folder: Path) -> list[Frame]:
-    """Return every labelled frame in the lists of ``folder`` (or in label.txt alone), sorted by recording and number."""
+    """Return every labelled frame in the lists of ``folder``, sorted by recording and number."""
     known: dict[tuple[str, int], Frame] = {}
-    present = [name for name in LIST_FILES[:4] if (folder / name).is_file()]
-    if {"train.txt", "test.txt"} <= set(present):
-        if len(present) == 3:
-            raise ValueError(f"{folder} has {present[2]} without its counterpart: fetch both, or remove it")
-        for name in present:
-            _add_list(known, folder / name, name.split(".")[0].removesuffix("_rough"), "rough" in name)
-    elif not present and (folder / "label.txt").is_file():
-        _add_list(known, folder / "label.txt", "label", False)
-    else:
-        raise ValueError(f"{folder} has no train.txt and test.txt: they are in {AT} (--data.lists)")
+    for name in LIST_FILES:
+        if not (folder / name).is_file():
+            raise ValueError(f"{folder} has no {name}: the lists are in {AT} (--data.lists)")
+        _add_list(known, folder / name, name.split(".")[0].removesuffix("_rough"), "rough" in name)
     labelled = [frame for frame in known.values() if frame.category >= 0 or frame.rough >= 0]
     return sorted(labelled, key=lambda frame: (frame.recording, frame.number))
 

@@ -1,6 +1,5 @@
 """``--data touch-and-go``: Touch and Go (Yang et al., NeurIPS 2022), read as published.
 
-    <root>/label.txt                            all labelled frames, "<rec>/<10 digits>.jpg,<int>"
     <root>/dataset/<rec>/video.mp4              camera, 640 x 480
                          gelsight.mp4           touch; frame i pairs with frame i of the camera, from 0
                          video_frame/<10 digits>.jpg   gelsight_frame/<10 digits>.jpg    as extracted by the owners' script
@@ -45,8 +44,7 @@ class TouchAndGoConfig(DatasetConfig):
     root: Path = Path("touch_and_go")
     """Folder of the download: with dataset/<recording>/ in it, or with the recordings themselves."""
     lists: Path | None = None
-    """Folder with train.txt, test.txt, train_rough.txt and test_rough.txt; default: root. If root has only label.txt,
-    there is no rough/smooth task and no official split."""
+    """Folder with train.txt, test.txt, train_rough.txt and test_rough.txt; default: root."""
     split: Literal["by-recording", "official"] = "by-recording"
     """by-recording: each recording is in one split, so scores are for unseen places. official: the owners' lists, as in
     the paper; 100 of their 106 test recordings are also in train, which results note."""
@@ -89,8 +87,6 @@ class TouchAndGo(Source):
         if not self._lists.is_dir():
             raise ValueError(f"{self._lists} is not a folder: give the one with the lists; get them from {lists.AT}")
         listed = lists.read_lists(self._lists)
-        if config.split == "official" and listed[0].listed == "label":
-            raise ValueError(f"{self._lists} has no train.txt and test.txt, which the official split needs: {lists.AT}")
         names = sorted({frame.recording for frame in listed})
         modalities = MODALITIES if config.modalities == "both" else (config.modalities,)
         found, missing = recordings.find_recordings(config.root, names, modalities)
@@ -110,11 +106,10 @@ class TouchAndGo(Source):
         self._stamps = [one_stamp(self._recordings[name].stamps(numbers)) for name, numbers in frames]
         notes = lists.leaks(listed) if config.split == "official" else []
         notes += [lacking] * bool(missing)
-        self._spec = _spec(config, any(frame.rough >= 0 for frame in listed), tuple(notes), bool(missing))
-        files = [file for file in sorted(self._lists.glob("*.txt")) if file.name in lists.LIST_FILES]
+        self._spec = _spec(config, tuple(notes), bool(missing))
         self._fingerprint = {
             "reader": f"touch-and-go {VERSION}",
-            "lists": {file.name: digest_file(file) for file in files},
+            "lists": {name: digest_file(self._lists / name) for name in sorted(lists.LIST_FILES)},
             "options": {k: v for k, v in to_json(config).items() if k not in ("root", "lists", *KEEPING)},
             "recordings": digest([[r.name, *(place.name for place in r.places.values())] for r in found]),
             "missing": dict(sorted(missing.items())),
@@ -147,10 +142,9 @@ class TouchAndGo(Source):
             if frame.number in lost:
                 samples.append(Lost(f"{frame.recording}/{frame.number:010d}", lost[frame.number]))
             else:
-                sizes = {modality: found[frame.number][0] for modality, found in images.items()}
-                own = {modality: found[frame.number][1] for modality, found in images.items()}
+                own = {modality: found[frame.number] for modality, found in images.items()}
                 columns = _columns(frame, self._spec)
-                samples.append(Sample(vision=own.get("vision"), touch=own.get("touch"), columns=columns, sizes=sizes))
+                samples.append(Sample(vision=own.get("vision"), touch=own.get("touch"), columns=columns))
         return samples
 
 
@@ -175,21 +169,26 @@ def _columns(frame: Frame, spec: DataSpec) -> dict[str, Any]:
         "frame": frame.number,
         "label_category": frame.category,
         "label_soft": -1 if frame.category < 0 else int(frame.category in lists.SOFT),
+        "label_rough": frame.rough,
     }
-    for task in spec.tasks[2:]:
-        columns |= {"label_rough": frame.rough, **({task.split: frame.split_rough} if task.split != "split" else {})}
+    own = spec.tasks[2].split
+    if own != "split":
+        columns[own] = frame.split_rough
     return columns
 
 
-def _spec(config: TouchAndGoConfig, rough: bool, notes: tuple[str, ...], missing: bool) -> DataSpec:
+def _spec(config: TouchAndGoConfig, notes: tuple[str, ...], missing: bool) -> DataSpec:
     # The rough/smooth lists have another split than the category lists.
     own = "split_rough" if config.split == "official" else "split"
-    tasks = [Task(name="category", classes=lists.CLASSES), Task(name="soft", classes=("hard", "soft"))]
+    hard, rough = (
+        Task(name="soft", classes=("hard", "soft")),
+        Task(name="rough", classes=("smooth", "rough"), split=own),
+    )
     return DataSpec(
         name=f"touch-and-go ({config.split}{', partial' if missing else ''})",
         vision_channels=3 * (config.modalities != "touch"),
         touch_channels=3 * (config.modalities != "vision"),
-        tasks=(*tasks, *([Task(name="rough", classes=("smooth", "rough"), split=own)] if rough else [])),
+        tasks=(Task(name="category", classes=lists.CLASSES), hard, rough),
         group_by="recording",
         licence="CC BY 4.0 (says its homepage)",
         source=f"Touch and Go, Yang et al., NeurIPS 2022, {HOMEPAGE}",

@@ -3,7 +3,6 @@
 Each modality of a recording is an mp4 file or a folder of JPEGs named by frame number (the layout is in ``reader.py``).
 """
 
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +11,8 @@ import numpy as np
 
 from mvitac.data.images import decode, shrink
 from mvitac.data.source import Stamp, stamp_of
-from mvitac.data.video import frame_shape
-from mvitac.data.video import frames as video_frames
+from mvitac.data.spec import listed
+from mvitac.data.video import frames
 
 HOMEPAGE = "https://touch-and-go.github.io"
 STEMS = {"vision": "video", "touch": "gelsight"}
@@ -62,36 +61,25 @@ def find_recordings(
 
 
 def missing_report(missing: dict[str, str], num: int) -> str:
-    """Return e.g. '3 of 126 listed recordings cannot be packed: no folder (2): a, b; no video.mp4 (1): c'."""
-    by_reason: dict[str, list[str]] = defaultdict(list)
-    for name, why in missing.items():
-        by_reason[why].append(name)
-    each = [(f"{why} ({len(names)})", ", ".join(names[:8]), len(names) > 8) for why, names in sorted(by_reason.items())]
-    parts = [f"{what}: {first}{', ...' * more}" for what, first, more in each]
-    return f"{len(missing)} of {num} listed recordings cannot be packed: {'; '.join(parts)}"
+    """Return e.g. '3 of 126 listed recordings cannot be packed: c (no video.mp4), a (no folder), b (no folder)'."""
+    named = [f"{name} ({why})" for name, why in sorted(missing.items(), key=lambda one: one[1], reverse=True)]
+    return f"{len(missing)} of {num} listed recordings cannot be packed: {listed(named)}"
 
 
-Shape = tuple[int, int]  # height and width
-
-
-def read_frames(
-    place: Path, numbers: list[int], size: int, lost: dict[int, str]
-) -> dict[int, tuple[Shape, np.ndarray]]:
-    """Return frame number -> original shape and image [size, size, 3] of one modality.
+def read_frames(place: Path, numbers: list[int], size: int, lost: dict[int, str]) -> dict[int, np.ndarray]:
+    """Return frame number -> image [size, size, 3] of one modality.
 
     Frames that cannot be read are put in ``lost`` with the reason.
     """
     if place.suffix:
         why: dict[int, str] = {}
-        shape = frame_shape(place)
-        found = {number: (shape, image) for number, image in video_frames(place, numbers, size, lost=why)}
+        found = dict(frames(place, numbers, size, lost=why))
         lost.update({number: f"{place.name}: frame {reason}" for number, reason in why.items()})
         return found
     found = {}
     for number in numbers:
         try:
-            image = decode(place / f"{number:010d}.jpg")
-            found[number] = (image.height, image.width), shrink(image, size)
+            found[number] = shrink(decode(place / f"{number:010d}.jpg"), size)
         except (ValueError, OSError) as error:
             lost[number] = str(error)
     return found
