@@ -38,7 +38,7 @@ from PIL import Image
 from mvitac.data.build import build
 from mvitac.data.images import fit
 from mvitac.data.source import Source
-from mvitac.datasets.calandra.reader import PHASES, CalandraConfig
+from mvitac.datasets.calandra import PHASES, CalandraConfig
 from mvitac.datasets.touch_and_go.reader import TouchAndGoConfig
 from mvitac.system.files import write_json
 from mvitac.system.provenance import provenance

@@ -19,8 +19,7 @@ import pytest
 from mvitac.bench.suite import find_suite, open_set
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
-from mvitac.datasets.calandra.objects import AUTHORS_TEST, AUTHORS_TRAIN, owners_shuffle
-from mvitac.datasets.calandra.reader import PHASES, Calandra, CalandraConfig
+from mvitac.datasets.calandra import AUTHORS_TEST, AUTHORS_TRAIN, PHASES, Calandra, CalandraConfig, owners_shuffle
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.probe import split_rows
@@ -116,13 +115,6 @@ def test_a_pack_depends_on_what_the_shards_hold_and_when_they_were_written(folde
         assert (old != new) == name.startswith("calandra_corl2017_000")
 
 
-def test_any_subset_of_shards(folder: Path) -> None:
-    source = CalandraConfig(path=folder, shards=(2,), split="object").source()
-    assert len(source.items()) == 12 and all("_002.h5" in name for name in source.items())
-    with pytest.raises(ValueError, match=r"no calandra_corl2017_001\.h5"):
-        CalandraConfig(path=folder, shards=(1,)).source()
-
-
 # -- names ------------------------------------------------------------------------------------------------------------
 
 
@@ -179,14 +171,11 @@ def test_damaged_grasps_are_listed_and_the_rest_is_read(tmp_path: Path) -> None:
 def test_a_truncated_shard_is_named(folder: Path, tmp_path: Path) -> None:
     path = Path(shutil.copytree(folder, tmp_path / "d")) / "calandra_corl2017_000.h5"
     path.write_bytes(path.read_bytes()[:-2000])
-    with pytest.raises(ValueError, match=r"_000\.h5 cannot be read .*: download it, or leave it out of shards"):
+    with pytest.raises(ValueError, match=r"_000\.h5 cannot be read .*: download it again, or remove it"):
         CalandraConfig(path=path.parent).source()
-    assert CalandraConfig(path=path.parent, shards=(2,)).source().items()
 
 
 def test_missing_data_is_said(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="is not a folder"):
-        CalandraConfig(path=tmp_path / "nowhere").source()
     with pytest.raises(ValueError, match="OPARA"):
         CalandraConfig(path=tmp_path).source()
     write_shard(tmp_path, 0, [b"some_other_thing"])

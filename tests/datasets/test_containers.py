@@ -16,7 +16,7 @@ from PIL import Image
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.folder import FolderConfig
-from mvitac.datasets.lerobot.reader import LeRobotConfig, choose
+from mvitac.datasets.lerobot import LeRobotConfig, choose
 from mvitac.datasets.table.table import RowsConfig
 from support.videos import film, shade
 
@@ -184,7 +184,7 @@ def test_lerobot_says_what_is_missing(tmp_path: Path) -> None:
     (root / f"videos/{GEL}/chunk-000/file-001.mp4").unlink()
     refused(root, r"file-001\.mp4 is missing: fetch the videos too")
     (root / "data/chunk-000/file-001.parquet").write_text("no")
-    refused(root, r"file-001\.parquet is not a parquet file")
+    refused(root, r"file-001\.parquet cannot be read as a table")
 
 
 # -- values -----------------------------------------------------------------------------------------------------------

@@ -681,14 +681,13 @@ def test_commands_say_what_a_group_is(tmp_path: Path, rows: Table, capsys: pytes
 
 
 def test_rows_that_share_something_are_told_where_no_group_is_given(tmp_path: Path, rows: Table) -> None:
-    """File names up to their last number, and columns of text, but not numbers, labels by another name and splits."""
+    """File names up to their last number, and columns of text, but not numbers."""
     given = []
     for i, row in enumerate(rows):
         names = {m: f"{m}/rec-{i // 6}_{i:03d}b.png" for m in ("vision", "left", "right")}
         for m, name in names.items():
             (tmp_path / str(row[m])).rename(tmp_path / name)
-        more = {"press": f"press {i // 2}", "kind": f"a {row['material']}" * bool(row["material"])}
-        given.append({**names, "material": row["material"], "seq": row["seq"], "side": row["side"], **more})
+        given.append({**names, "material": row["material"], "seq": row["seq"], "press": f"press {i // 2}"})
     file = write(given, tmp_path / "m.csv")
     (note,) = FolderConfig(path=file, labels=("material",), split_seed=1).source().spec().notes
     assert re.search(r"also in train: press \d of \d, vision files 4 of 4\)$", note)

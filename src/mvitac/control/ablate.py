@@ -28,7 +28,7 @@ from mvitac.control.learn import encoding, pixels, ridge
 from mvitac.control.suite import OWN
 from mvitac.data.pack import Pack
 from mvitac.data.windows import places
-from mvitac.datasets.lerobot.reader import FELT
+from mvitac.datasets.lerobot import FELT
 from mvitac.deploy.artifact import load
 from mvitac.evaluation.intervals import mean_interval
 from mvitac.registry import unknown

@@ -142,30 +142,22 @@ def read_controls(table: Manifest, columns: Iterable[str], labels: Sequence[Sequ
     return made
 
 
-def ungrouped(texts: Mapping[str, Sequence[str]], splits: Sequence[str], labels: Sequence[Sequence[int]]) -> str:
+def ungrouped(texts: Mapping[str, Sequence[str]], splits: Sequence[str]) -> str:
     """Say that every row is its own group, and which texts repeat themselves in train and in test.
 
-    ``texts``: the cells of each column. Those that hold numbers, or say the same as a label, are no names of objects.
+    ``texts``: the cells of each column. Those that hold numbers, or other splits, are no names of objects.
     """
     found = []
     for name, cells in texts.items():
         values = set(cells) - {""}
-        if values <= set(SPLITS) or (name not in KEYS and all(number_of(value) is not None for value in values)):
-            continue
-        if not 1 < len(values) <= len(cells) / 2 or any(_renames(cells, label) for label in labels):
+        numbers = name not in KEYS and all(number_of(value) is not None for value in values)
+        if numbers or values <= set(SPLITS) or not 1 < len(values) <= len(cells) / 2:
             continue
         test = {cell for cell, split in zip(cells, splits, strict=True) if split == "test"} - {""}
-        train = {cell for cell, split in zip(cells, splits, strict=True) if split != "test"}
-        if both := test & train:
+        if both := test & {cell for cell, split in zip(cells, splits, strict=True) if split != "test"}:
             found.append(f"{name} {len(both)} of {len(test)}")
     shared = f" (of those in test, also in train: {listed(found, 6)})" if found else ""
     return (
         f"{UNGROUPED}, so every row is its own group: where rows show one object or recording, scores are too high and"
         f" intervals too narrow{shared}"
     )
-
-
-def _renames(cells: Sequence[str], labels: Sequence[int]) -> bool:
-    """Whether each cell stands for one label and each label for one cell."""
-    pairs = {(cell, label) for cell, label in zip(cells, labels, strict=True) if cell and label >= 0}
-    return len(pairs) == len({cell for cell, _ in pairs}) == len({label for _, label in pairs})

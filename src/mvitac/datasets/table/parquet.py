@@ -17,19 +17,17 @@ from mvitac.datasets.table.image_refs import ImageRef, ParquetCell
 from mvitac.datasets.table.manifest import Manifest, Row, text_of
 from mvitac.system.files import brief, parse_json
 
+Refs = dict[str, list[ImageRef | None]]
 SPLITS = {"train": "train", "validation": "val", "valid": "val", "val": "val", "test": "test"}
 
 
 def read_parquet(path: Path, files: Sequence[Path], vectors: Collection[str]) -> Manifest | None:
     """Return the table of ``files``, which are ``path`` or in this folder; None if they hold no images."""
     rows: list[Row] = []
-    found: dict[str, list[ImageRef | None]] = {}
+    found: Refs = {}
     for file in files:
         before = len(rows)
-        try:
-            _add(pq.ParquetFile(file), str(file), rows, found, vectors)
-        except (pa.ArrowException, OSError) as error:
-            raise ValueError(f"{file} cannot be read as a table: {brief(error)}") from None
+        add_file(file, rows, found, vectors)
         if side := SPLITS.get(file.stem.split("-")[0]):
             for row in rows[before:]:
                 row.setdefault("split", side)
@@ -39,26 +37,29 @@ def read_parquet(path: Path, files: Sequence[Path], vectors: Collection[str]) ->
     return Manifest.of(path, rows, found) if found else None
 
 
-def _add(
-    opened: pq.ParquetFile,
-    path: str,
-    rows: list[Row],
-    found: dict[str, list[ImageRef | None]],
-    vectors: Collection[str],
+def add_file(
+    file: Path, rows: list[Row], found: Refs, vectors: Collection[str], cameras: Collection[str] | None = None
 ) -> None:
-    """Add the rows of a file, and the references of their images; None where there is none."""
-    schema, classes = opened.schema_arrow, _classes(opened.schema_arrow)
-    images = [field.name for field in schema if _is_image(field.type)]
-    flat = [field.name for field in schema if not pa.types.is_nested(field.type) or field.name in vectors]
-    texts = [name for name in flat if name not in images]
-    for group in range(opened.num_row_groups if images else 0):
-        num = opened.metadata.row_group(group).num_rows
-        table = opened.read_row_group(group, columns=texts).to_pylist() if texts else [{}] * num
-        rows += [{name: _text(value, classes.get(name)) for name, value in values.items()} for values in table]
-        for column in images:
-            there = _there(opened, group, column, num)
-            cells = (ParquetCell(path, group, column, i) if there[i] else None for i in range(num))
-            found.setdefault(column, []).extend(cells)
+    """Add the rows of a file, and the references of its images; None where there is none.
+
+    ``cameras``: which columns of images are wanted; by default all, and no row if there is no such column.
+    """
+    try:
+        opened = pq.ParquetFile(file)
+        schema, classes = opened.schema_arrow, _classes(opened.schema_arrow)
+        images = [field.name for field in schema if _is_image(field.type)]
+        flat = [field.name for field in schema if not pa.types.is_nested(field.type) or field.name in vectors]
+        texts = [name for name in flat if name not in images]
+        for group in range(opened.num_row_groups if images or cameras is not None else 0):
+            num = opened.metadata.row_group(group).num_rows
+            table = opened.read_row_group(group, columns=texts).to_pylist() if texts else [{}] * num
+            rows += [{name: _text(value, classes.get(name)) for name, value in values.items()} for values in table]
+            for column in (column for column in images if cameras is None or column in cameras):
+                there = _there(opened, group, column, num)
+                cells = (ParquetCell(str(file), group, column, i) if there[i] else None for i in range(num))
+                found.setdefault(column, []).extend(cells)
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(f"{file} cannot be read as a table: {brief(error)}") from None
 
 
 def _is_image(kind: pa.DataType) -> bool:

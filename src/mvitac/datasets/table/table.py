@@ -1,4 +1,4 @@
-"""Reads a table of samples: labels, groups, splits, controls, and the images that its rows refer to.
+"""A dataset that is a table of samples: labels, groups, splits, controls, and the images that its rows refer to.
 
 The table is checked completely before the first image is decoded.
 """
@@ -6,22 +6,23 @@ The table is checked completely before the first image is decoded.
 import math
 import os
 import re
-from abc import ABC
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
 
 from mvitac.data.pack_table import SPLITS
 from mvitac.data.source import Lost, Sample, Source, one_stamp
 from mvitac.data.spec import AnyTask, DataSpec
-from mvitac.datasets.base import KEEPING
-from mvitac.datasets.table import clocks, columns, image_columns, splits
-from mvitac.datasets.table.columns import all_hold, value_task
-from mvitac.datasets.table.image_columns import Background
+from mvitac.datasets.base import KEEPING, DatasetConfig
+from mvitac.datasets.table import clocks, columns, images, splits
+from mvitac.datasets.table.columns import Condition, all_hold, value_task
 from mvitac.datasets.table.image_refs import span_of
-from mvitac.datasets.table.manifest import Manifest
-from mvitac.datasets.table.options import TableOptions
-from mvitac.datasets.table.read_rows import Row, bundles, read_rows
+from mvitac.datasets.table.images import Background, Row, bundles, read_rows
+from mvitac.datasets.table.manifest import Manifest, number_of
 from mvitac.datasets.table.splits import BY_GROUP
 from mvitac.registry import check_range, to_json, unknown
 
@@ -29,11 +30,136 @@ VERSION = 3  # version of this reader. Increase it when the same table would giv
 MAX_TOGETHER = 1024  # rows of one video that are read in one pass, if their images fit into ``MAX_TOGETHER_BYTES``
 MAX_TOGETHER_BYTES = 600 << 20
 """Memory per worker for these images at the stored size: 1024 rows of two gels and a camera at 256 px."""
+CONTROL_NAMES = ("majority", "pixels", "border", "untrained", "imagenet", "start")
+"""Controls that every probe computes by itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RowsConfig(TableOptions, ABC):
-    """A dataset that is a table."""
+class RowsConfig(DatasetConfig, ABC):
+    """A dataset that is a table: which columns mean what."""
+
+    path: Path = Path("data")
+    """Path of the data."""
+    title: str | None = None
+    """Name of the dataset in results; default: the folder's name."""
+    vision: str | None = None
+    """Column of camera images; default: "vision" if it exists; "" = none."""
+    touch: tuple[str, ...] = ()
+    """Column of tactile images, or two columns (left right) to stack on channels; default: "touch" if it exists, else
+    "left" and "right"; "" = none."""
+    labels: tuple[str, ...] = ()
+    """Columns that become tasks. Classes are the sorted distinct values; an empty cell or NaN is unlabelled. Unicode
+    forms and blanks are made equal."""
+    values: tuple[str, ...] = ()
+    """Columns of numbers to predict, as column:unit, e.g. force_n:N; or several as one task: pose=z_mm:mm,tilt_deg:deg.
+    state[2] is the third number of a column of lists. An empty cell or NaN is not measured."""
+    group: str | None = None
+    """Column of the group (object, recording), the unit of splits and confidence intervals; default: "group" if it
+    exists, else the video of the row's frame, else each row is its own group."""
+    touch_group: str | None = None
+    """Column of near-duplicates (one touch, one grasp), which a batch keeps apart; default: the group."""
+    split: str | None = None
+    """Column with train, val, test or unlabelled; default: "split" if it exists, else "by-group", which assigns whole
+    groups using the next three fields."""
+    test_share: float = 0.25
+    """Fraction of groups in the test split (by-group)."""
+    val_share: float = 0.15
+    """Fraction of groups in the validation split (by-group)."""
+    split_seed: int = 0
+    """Random seed for assigning groups to splits (by-group)."""
+    allow_leak: bool = False
+    """Accept a group, touch group or image that is in more than one split."""
+    allow_missing: bool = False
+    """Accept rows without a camera image or without a tactile image. Pairs and probes skip them where they need it."""
+    controls: tuple[str, ...] = ()
+    """Controls as "name=column[,column]": a logistic regression on these columns of numbers instead of features."""
+    only: tuple[str, ...] = ()
+    """Conditions on the rows to read, e.g. "seq<=4" "sensor=digit" "label_conflict!=1"; all must hold."""
+    label_only: tuple[str, ...] = ()
+    """Conditions on the rows whose labels count; other rows are unlabelled and used for pre-training only."""
+    sensor: str | None = None
+    """Column with the name of the touch sensor; default: "sensor" if it exists."""
+    difference: Annotated[bool, tyro.conf.arg(name="subtract-background")] = False
+    """Store (touch - background) / 2 + 128 instead of the raw image, so that no contact is mid-gray."""
+    background: tuple[str, ...] = ()
+    """Columns of the no-contact images, one per touch column; default: "background"."""
+    no_contact: tuple[str, ...] = ()
+    """Conditions on rows without contact, e.g. "phase=empty". They are not samples: the mean of the first 16 of a sensor
+    is its background."""
+    log: tuple[str, ...] = ()
+    """Logs with a clock of their own, as FILE:COLUMN (the column of time stamps), e.g. force.csv:stamp; stamp-0.35 sets
+    that clock back. Their columns are joined to the rows by time (``datasets/table/clocks.py``)."""
+    tolerance: float = 0.02
+    """Largest distance in seconds of a row from a measurement of its logs, or a frame of its other cameras."""
+    interpolate: Literal["linear", "nearest"] = "linear"
+    """How the numbers of values are taken from logs. Other columns are of the nearest time."""
+    crop: tuple[str, ...] = ()
+    """Part of the images to use, as COLUMN=x:y:width:height in pixels from the top left corner, e.g. touch=40:0:560:480.
+    It is squeezed to a square, as every image is."""
+    range: tuple[str, ...] = ()
+    """Of images of 16 bits or floating-point numbers (.png, .tif, .npy, arrays): what becomes black and white, as
+    COLUMN=LOW:HIGH; by default 0 and 65535, or 0 and 1 of floats."""
+    bgr: bool = False
+    """Images are stored blue first, as OpenCV writes arrays to HDF5 or zarr."""
+    licence: str = "unknown"
+    """Licence of the data."""
+    source_url: str = ""
+    """URL of the data."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_range(self, 0, 1, "test_share", "val_share")
+        check_range(self, 0, math.inf, "split_seed", "tolerance")
+        if self.test_share + self.val_share >= 1:
+            raise ValueError(f"test_share {self.test_share} and val_share {self.val_share} leave nothing to train on")
+        if self.background and self.no_contact:
+            raise ValueError("background and no_contact: give only one of them, a touch has one background")
+        if (self.background or self.no_contact) and not self.difference:
+            raise ValueError("a background is only used with subtract-background: add that option, or leave this out")
+        self.conditioned()
+        self.looks()
+        if len(self.touch) > 2:
+            raise ValueError(f"touch {' '.join(self.touch)}: give one column, or two to stack (left right)")
+        for name in self.control_columns():
+            if name in CONTROL_NAMES:
+                raise ValueError(f"control {name!r} is always computed: choose another name")
+
+    def control_columns(self) -> dict[str, tuple[str, ...]]:
+        """Return control name -> manifest columns."""
+        pairs = [text.partition("=") for text in self.controls]
+        if len({name.strip() for name, _, _ in pairs}) < len(pairs):
+            raise ValueError(f"controls {' '.join(self.controls)}: give every control a name of its own")
+        return {name.strip(): tuple(c.strip() for c in listed.split(",")) for name, _, listed in pairs}
+
+    def numbers(self) -> list[str]:
+        """Return the manifest columns that hold numbers: those of values, and those of controls."""
+        named = [target.name for text in self.values for target in value_task(text).targets]
+        return [*named, *(column for used in self.control_columns().values() for column in used)]
+
+    def looks(self) -> dict[str, dict[str, Any]]:
+        """Return image column -> fields of its references: crop, span and bgr."""
+        looks: dict[str, dict[str, Any]] = {}
+        for name, texts, many in (("crop", self.crop, 4), ("span", self.range, 2)):
+            for text in texts:
+                column, _, listed = text.partition("=")
+                numbers = [number for part in listed.split(":") if (number := number_of(part)) is not None]
+                good = len(numbers) == many == listed.count(":") + 1
+                if not good or (numbers[0] >= numbers[1] if many == 2 else min(numbers) < 0 or not all(numbers[2:])):
+                    raise ValueError(f"{text!r}: write COLUMN={'x:y:width:height' if many == 4 else 'LOW:HIGH'}")
+                looks.setdefault(column, {})[name] = tuple(map(int, numbers) if many == 4 else numbers)
+        return looks
+
+    def conditioned(self) -> list[str]:
+        """Return the columns that the conditions name."""
+        return [Condition.parse(text).column for text in (*self.only, *self.label_only, *self.no_contact)]
+
+    def vectors(self) -> set[str]:
+        """Return the columns of lists of numbers of which an element is named, such as state of state[2]."""
+        return {columns.element_of(name)[0] for name in self.numbers()} - {""}
+
+    @abstractmethod
+    def manifest(self) -> Manifest:
+        """Return the table; ValueError if it does not exist or is invalid."""
 
     def source(self) -> Source:
         return Rows(self)
@@ -56,12 +182,17 @@ class RecordedConfig(RowsConfig, ABC):
 class Rows(Source):
     """Reads a table. An item is one row, or the rows of one video (one row group, ...), which are read in one pass."""
 
-    def __init__(self, config: TableOptions) -> None:
+    def __init__(self, config: RowsConfig) -> None:
         self._config = config
         self._title = config.title or (config.path if config.path.is_dir() else config.path.parent).resolve().name
-        table = columns.with_elements(self._joined(config.manifest()), config.numbers())
+        table = config.manifest()
+        if config.log:
+            names = [name for name in (*config.touch, config.vision, "touch", "left", "right", "vision") if name]
+            how: Any = {"tolerance": config.tolerance, "linear": config.interpolate == "linear"}
+            table = clocks.join(table, config.log, names, numbers=config.numbers(), **how)
+        table = columns.with_elements(table, config.numbers())
         self._digest = table.digest
-        self._vision, self._touch = image_columns.find(table, config.vision, config.touch)
+        self._vision, self._touch = images.find(table, config.vision, config.touch)
         self._images = tuple(column for column in (self._vision, *self._touch) if column)
         self._group = config.group or ("group" if "group" in table.columns else table.group)
         self._split = config.split or ("split" if "split" in table.columns else BY_GROUP)
@@ -75,8 +206,8 @@ class Rows(Source):
 
         table, grounds = self._select(table)
         asked = {"vision": self._images[: bool(self._vision)], "touch": self._touch}
-        missing = image_columns.check_present(table, asked, config.allow_missing)
-        stamps = image_columns.check_files(table, self._images, grounds)
+        missing = images.check_present(table, asked, config.allow_missing)
+        stamps = images.check_files(table, self._images, grounds)
 
         group_by, groups = self._grouping(table)
         touch_groups = table.filled(config.touch_group, "touch_group") if config.touch_group else groups
@@ -108,49 +239,32 @@ class Rows(Source):
             controls=controls,
             licence=config.licence,
             source=config.source_url or "not given",
-            notes=self._notes(table, group_by, assigned, {task.name: label for task, label in read}),
+            notes=self._notes(table, group_by, assigned),
             difference=config.difference,
         )
 
-    def _scaled(self, table: Manifest) -> tuple[str, ...]:
-        """Say what is cropped, and how more than 8 bits become gray levels, judged by the first image of each column."""
-        notes = [f"{text} is the part of the images that is used, squeezed to a square" for text in self._config.crop]
-        for column in self._images:
-            ref = next((ref for ref in table.images[column] if ref), None)
-            if ref and (span := span_of(ref)):
-                notes.append("{} has more than 8 bits: {:g} is black, {:g} white".format(column, *span))
-        return tuple(notes)
-
-    def _joined(self, table: Manifest) -> Manifest:
-        """Return ``table`` with the columns of the logs."""
-        config, names = self._config, ("touch", "left", "right", "vision")
-        images = [name for name in (*config.touch, config.vision, *names) if name]
-        how: Any = {"tolerance": config.tolerance, "linear": config.interpolate == "linear"}
-        return clocks.join(table, config.log, images, numbers=config.numbers(), **how) if config.log else table
-
     def _select(self, table: Manifest) -> tuple[Manifest, list[Background]]:
         """Return the rows that become samples with their images, and the background of each (none for raw images)."""
-        config = self._config
-        backgrounds = (config.background or ("background",)) if config.difference and not config.no_contact else ()
-        table.check(*backgrounds)
-        paths = {*self._images, *(config.background or ("background",))}
-        table = table.resolved((*self._images, *backgrounds), paths)
+        config, grounds = self._config, self._config.background or ("background",)
+        shown = (*self._images, *(grounds if config.difference and not config.no_contact else ()))
+        table.check(*shown)
+        table = table.resolved(shown, {*self._images, *grounds})
         if (looks := config.looks()) or config.bgr:
             table.check(*looks)
-            like = dict(zip(backgrounds, self._touch, strict=False))  # a background is cropped as its touch
-            how = {column: looks.get(like.get(column, column), {}) | {"bgr": config.bgr} for column in table.images}
+            like = dict(zip(grounds, self._touch, strict=False))  # a background is cropped as its touch
+            how = {column: looks.get(like.get(column, column), {}) | {"bgr": config.bgr} for column in shown}
             seen = {c: [ref and replace(ref, **how[c]) for ref in refs] for c, refs in table.images.items()}
             table = replace(table, images=seen)
         table = table.kept(all_hold(config.only, table), f"no row meets {' and '.join(config.only)}")
         if not config.no_contact and not config.difference:
             return table, []
         empty = all_hold(config.no_contact, table) if config.no_contact else None
-        grounds = image_columns.backgrounds(table, self._touch, config.background, self._sensor, empty)
+        found = images.backgrounds(table, self._touch, grounds, self._sensor, empty)
         if empty is None:
-            return table, grounds
+            return table, found
         kept = [not none for none in empty]
-        grounds = [ground for ground, keep in zip(grounds, kept, strict=True) if keep]
-        return table.kept(kept, f"every row meets {' and '.join(config.no_contact)}"), grounds
+        found = [ground for ground, keep in zip(found, kept, strict=True) if keep]
+        return table.kept(kept, f"every row meets {' and '.join(config.no_contact)}"), found
 
     def _grouping(self, table: Manifest) -> tuple[str, list[str]]:
         """Return what a group is, and the group of each row."""
@@ -185,22 +299,25 @@ class Rows(Source):
         splits.check_sides(where, column, found, tasks, labels, len(set(groups)))
         return found
 
-    def _notes(
-        self, table: Manifest, group_by: str, assigned: Sequence[str], labels: dict[str, list[int]]
-    ) -> tuple[str, ...]:
-        """What results say about logs, and about groups that no column names."""
-        told = (*table.notes, *self._scaled(table))
+    def _notes(self, table: Manifest, group_by: str, assigned: Sequence[str]) -> tuple[str, ...]:
+        """What results say about logs, about how images are shown, and about groups that no column names."""
+        notes = [*table.notes]
+        notes += [f"{text} is the part of the images that is used, squeezed to a square" for text in self._config.crop]
+        for column in self._images:  # judged by the first image
+            ref = next((ref for ref in table.images[column] if ref), None)
+            if ref and (span := span_of(ref)):
+                notes.append("{} has more than 8 bits: {:g} is black, {:g} white".format(column, *span))
         if group_by == "video":
-            return (*told, "no column says the groups, so frames of one video are one group")
-        if group_by != "row":
-            return told
-        known = {*labels, self._split, self._sensor, *self._images}
-        texts = {name: [row[name] for row in table.rows] for name in table.rows[0] if name not in known}
-        for column in self._images:  # file names up to their last number
-            files = (os.path.splitext(os.path.basename(ref.path))[0] if ref else "" for ref in table.images[column])
-            if (stems := [re.sub(r"\d+\D*$", "", file) for file in files]) not in texts.values():
-                texts[f"{column} files"] = stems
-        return (*told, columns.ungrouped(texts, assigned, [*labels.values()]))
+            notes.append("no column says the groups, so frames of one video are one group")
+        if group_by == "row":
+            known = {*self._config.labels, *table.labels, self._split, self._sensor, *self._images}
+            texts = {name: [row[name] for row in table.rows] for name in table.rows[0] if name not in known}
+            for column in self._images:  # file names up to their last number
+                files = (os.path.splitext(os.path.basename(ref.path))[0] if ref else "" for ref in table.images[column])
+                if (stems := [re.sub(r"\d+\D*$", "", file) for file in files]) not in texts.values():
+                    texts[f"{column} files"] = stems
+            notes.append(columns.ungrouped(texts, assigned))
+        return tuple(notes)
 
     def _make_rows(
         self,

@@ -1,12 +1,19 @@
-"""Finds and checks the images that a table's rows refer to, and the background of each touch image."""
+"""The images that a table's rows refer to, and the background of each touch image: found, checked, and read.
+
+Those of one video (or row group, ...) are read together.
+"""
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from mvitac.data.source import Stamp, stamp_of
-from mvitac.datasets.table.image_refs import ImageRef
+import numpy as np
+
+from mvitac.data.images import difference, fit, shrink
+from mvitac.data.source import Lost, Sample, Stamp, stamp_of
+from mvitac.datasets.table.image_refs import Damage, ImageRef, mean_image, read_all
 from mvitac.datasets.table.manifest import Manifest
 
 NUM_NO_CONTACT = 16  # number of no-contact frames that are averaged to a sensor's background
@@ -36,19 +43,17 @@ def backgrounds(
 ) -> list[Background]:
     """Return the background of each row.
 
-    It is in ``columns``, one per column of ``touch`` (default: "background"). If ``empty`` says which rows show no
+    It is in ``columns``, one per column of ``touch``. If ``empty`` says which rows show no
     contact, it is the first of these of the row's ``sensor``.
     """
     if empty is None:
-        columns = columns or ("background",)
         if len(columns) != len(touch):
             raise ValueError(f"background {' '.join(columns)}: touch {' '.join(touch)} needs one column each")
-        table.check(*columns)
-        found = {column: table.refs(column) for column in columns}
-        for i in range(len(table.rows)):
-            if any(table.images[t][i] and not found[c][i] for t, c in zip(touch, columns, strict=True)):
+        found = [[table.images[c][i] for c in columns] for i in range(len(table.rows))]
+        for i, refs in enumerate(found):
+            if any(table.images[column][i] and not ref for column, ref in zip(touch, refs, strict=True)):
                 raise ValueError(f"{table.at(i)} has no {' or '.join(columns)}: difference images need one")
-        return [tuple((ref,) if (ref := found[c][i]) else () for c in columns) for i in range(len(table.rows))]
+        return [tuple((ref,) if ref else () for ref in refs) for refs in found]
     names = [row[sensor] if sensor else "" for row in table.rows]
     known: dict[str, Background] = {}
     for name in dict.fromkeys(names):
@@ -112,3 +117,77 @@ def check_files(table: Manifest, columns: Sequence[str], grounds: Sequence[Backg
         few = f"{len(missing)} of {num} image files are missing or empty, e.g. {'; '.join(missing[:3])}"
         raise ValueError(f"{table.path}: {few} (paths are relative to {table.root})")
     return stamps
+
+
+Loaded = dict[ImageRef, np.ndarray]  # images at the stored size
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One sample before its images are read: where they are, and the row's columns in the pack."""
+
+    number: int
+    vision: ImageRef | None
+    touch: tuple[ImageRef, ...]
+    background: tuple[tuple[ImageRef, ...], ...]
+    """Per touch image, the no-contact images whose mean is subtracted; empty for raw images."""
+    columns: dict[str, Any]
+
+    def refs(self) -> Iterator[ImageRef]:
+        """Yield the reference of every image that is needed."""
+        yield from (ref for ref in (self.vision, *self.touch) if ref)
+        yield from (ref for many in self.background for ref in many)
+
+
+def bundles(rows: Sequence[Row], most: int) -> list[list[int]]:
+    """Group row indices into items: at most ``most`` rows whose images are in the same containers; other rows alone."""
+    items: list[list[int]] = []
+    open_items: dict[Any, list[int]] = {}
+    for i, row in enumerate(rows):
+        key = tuple(ref.container() if ref else None for ref in (row.vision, *row.touch))
+        if not any(key):
+            items.append([i])
+            continue
+        item = open_items.get(key)
+        if item is None or len(item) == most:
+            item = open_items[key] = []
+            items.append(item)
+        item.append(i)
+    return items
+
+
+def read_rows(rows: Sequence[Row], size: int) -> list[Sample | Lost]:
+    """Return the samples of rows that ``bundles`` put together, with images of side ``size``.
+
+    A row with a damaged image is ``Lost``, or raises ValueError or OSError if it is the only one.
+    """
+    lost: Damage = {}
+    vision = _load([row.vision for row in rows if row.vision], size, lost)
+    num_touch = max(len(row.touch) for row in rows)
+    touch = [_load([row.touch[k] for row in rows if row.touch], size, lost) for k in range(num_touch)]
+    samples: list[Sample | Lost] = []
+    for row in rows:
+        try:
+            samples.append(_sample(row, vision, touch, size, lost))
+        except (ValueError, OSError) as error:
+            if len(rows) == 1:
+                raise
+            samples.append(Lost(f"row {row.number}", str(error)))  # the other rows of the video are still good
+    return samples
+
+
+def _load(refs: Sequence[ImageRef], size: int, lost: Damage) -> Loaded:
+    """Read images at the stored size (a whole video would not fit otherwise); damaged ones are put in ``lost``."""
+    return {ref: shrink(image, size) for ref, image in read_all(refs, lost)}
+
+
+def _sample(row: Row, vision: Loaded, touch: Sequence[Loaded], size: int, lost: Damage) -> Sample:
+    """Make the sample of ``row`` from the loaded images; ValueError if one of them is damaged."""
+    for ref in (row.vision, *row.touch):
+        if ref in lost:
+            raise ValueError(lost[ref])
+    pressed = [images[ref] for images, ref in zip(touch, row.touch, strict=False)]
+    for k, background in enumerate(row.background):
+        pressed[k] = difference(pressed[k], fit(mean_image(background), size))
+    image = vision[row.vision] if row.vision else None
+    return Sample(vision=image, touch=np.concatenate(pressed, axis=2) if pressed else None, columns=row.columns)

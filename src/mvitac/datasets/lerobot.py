@@ -15,7 +15,7 @@ used, so cameras may have different rates. If it is farther away than ``toleranc
 """
 
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -26,8 +26,9 @@ import pyarrow.parquet as pq
 
 from mvitac.data.video import frame_times
 from mvitac.datasets.table.clocks import nearest
-from mvitac.datasets.table.image_refs import Frame, ImageRef, ParquetCell
-from mvitac.datasets.table.manifest import Manifest, text_of
+from mvitac.datasets.table.image_refs import Frame, ImageRef
+from mvitac.datasets.table.manifest import Manifest, Row
+from mvitac.datasets.table.parquet import Refs, add_file
 from mvitac.datasets.table.table import RecordedConfig
 from mvitac.registry import unknown
 from mvitac.system.files import brief, parse_json, read_json
@@ -35,7 +36,6 @@ from mvitac.system.files import brief, parse_json, read_json
 FELT = re.compile(r"touch|tactile|gelsight|digit(?!al)|gel\b|finger", re.IGNORECASE)  # usual names of tactile cameras
 RENAMED = {"episode_index": "episode", "frame_index": "frame", "index": "id"}
 """Columns of the format -> names in a pack."""
-SCALARS = {"float16", "float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool", "string"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,17 +64,30 @@ class LeRobotConfig(RecordedConfig):
         cameras = [key for key, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
         names = choose(cameras, self.vision, self.touch, self.path)
         embedded = [key for key in names.values() if info["features"][key]["dtype"] == "image"]
-        rows, cells = _frames(self.path, info, embedded, self.every or 1, self.vectors())
-        found: dict[str, list[ImageRef | None]] = {}
+        rows, cells = self._frames(embedded)
+        found: Refs = {}
         for column, key in names.items():
             found[column] = cells[key] if key in cells else self._in_videos(info, key, rows)
         return Manifest.of(self.path, rows, found)
 
+    def _frames(self, embedded: Sequence[str]) -> tuple[list[Row], Refs]:
+        """Return the table rows as text, and the references of ``embedded`` images."""
+        tasks, rows, cells = _tasks(self.path), list[Row](), Refs()
+        for file in sorted((self.path / "data").glob("*/*.parquet")):
+            add_file(file, rows, cells, self.vectors(), embedded)
+        for name in ("timestamp", "episode_index", "frame_index", *embedded):
+            if name not in ({**rows[0], **cells} if rows else {}):
+                raise ValueError(f"{self.path / 'data'} has no column {name!r}: fetch the whole dataset")
+        kept = [i for i, row in enumerate(rows) if int(row["frame_index"]) % (self.every or 1) == 0]
+        named = [{RENAMED.get(name, name): cell for name, cell in rows[i].items()} for i in kept]
+        for row in named if "task_index" in rows[0] else ():
+            row["task"] = tasks.get(row["task_index"], "")
+        return named, {key: [refs[i] for i in kept] for key, refs in cells.items()}
+
     def _in_videos(self, info: dict[str, Any], key: str, rows: Sequence[dict[str, str]]) -> list[ImageRef | None]:
         """Return the frame of camera ``key`` at each row's time; None if no frame is near enough."""
-        episodes = {}
-        if is_new := str(info["codebase_version"]).startswith("v3"):
-            episodes = {str(e["episode_index"]): e for e in _tables(self.path, "meta/episodes", f"videos/{key}/")}
+        is_new = str(info["codebase_version"]).startswith("v3")
+        episodes = _episodes(self.path / "meta" / "episodes") if is_new else {}
         wanted: dict[str, list[int]] = {}
         for i, row in enumerate(rows):
             wanted.setdefault(row["episode"], []).append(i)
@@ -138,66 +151,26 @@ def _info(root: Path) -> dict[str, Any]:
     return info
 
 
-def _tables(root: Path, folder: str, *wanted: str) -> list[dict[str, Any]]:
-    """Return the rows of all parquet files in ``folder``: episode_index and the columns that begin with ``wanted``."""
-    rows: list[dict[str, Any]] = []
-    for _, opened in _open_all(root / folder):
-        names = [n for n in opened.schema_arrow.names if n == "episode_index" or n.startswith(wanted)]
-        rows += opened.read(columns=names).to_pylist()
-    return rows
+def _episodes(folder: Path) -> dict[str, dict[str, Any]]:
+    table = _read(folder)
+    names = [name for name in table.column_names if name == "episode_index" or name.startswith("videos/")]
+    return {str(episode["episode_index"]): episode for episode in table.select(names).to_pylist()}
 
 
-def _open_all(folder: Path) -> Iterator[tuple[Path, pq.ParquetFile]]:
-    files = sorted(folder.glob("*/*.parquet"))
-    if not files:
-        raise ValueError(f"{folder} holds no parquet files: fetch the whole dataset")
-    yield from ((file, _open(file)) for file in files)
-
-
-def _open(file: Path) -> pq.ParquetFile:
-    try:
-        return pq.ParquetFile(file)
-    except (pa.ArrowException, OSError) as error:
-        raise ValueError(f"{file} is not a parquet file ({brief(error)}): fetch it again") from None
-
-
-def _tasks(root: Path) -> dict[int, str]:
+def _tasks(root: Path) -> dict[str, str]:
+    """Return the text of each task_index."""
     file, lines = root / "meta" / "tasks.parquet", root / "meta" / "tasks.jsonl"
     if lines.is_file():
-        return {task["task_index"]: task["task"] for task in map(parse_json, lines.read_text().splitlines())}
+        return {str(task["task_index"]): task["task"] for task in map(parse_json, lines.read_text().splitlines())}
     if not file.is_file():
         return {}
-    table = _open(file).read()
+    table = _read(file)
     names = [name for name in table.column_names if name != "task_index"]
-    return dict(zip(table.column("task_index").to_pylist(), table.column(names[0]).to_pylist(), strict=True))
+    return dict(zip(map(str, table.column("task_index").to_pylist()), table.column(names[0]).to_pylist(), strict=True))
 
 
-def _frames(
-    root: Path, info: dict[str, Any], images: Sequence[str], every: int, vectors: Collection[str]
-) -> tuple[list[dict[str, str]], dict[str, list[ImageRef | None]]]:
-    """Return the table rows as text (scalar features and ``vectors``), and the references of embedded ``images``."""
-    tasks = _tasks(root)
-    scalars = [k for k, f in info["features"].items() if f["dtype"] in SCALARS and list(f.get("shape", [1])) == [1]]
-    rows: list[dict[str, str]] = []
-    cells: dict[str, list[ImageRef | None]] = {key: [] for key in images}
-    for file, opened in _open_all(root / "data"):
-        for name in ("timestamp", "episode_index", "frame_index", *images):
-            if name not in opened.schema_arrow.names:
-                raise ValueError(f"{file} has no column {name!r}: fetch it again")
-        wanted = {*scalars, *vectors, *RENAMED, "timestamp"}
-        names = [name for name in opened.schema_arrow.names if name in wanted]
-        for group in range(opened.num_row_groups):
-            for place, values in enumerate(opened.read_row_group(group, columns=names).to_pylist()):
-                if values["frame_index"] % every:
-                    continue
-                row = {RENAMED.get(str(name), str(name)): _text(value) for name, value in values.items()}
-                if "task_index" in values:
-                    row["task"] = tasks.get(values["task_index"], "")
-                rows.append(row)
-                for key in images:
-                    cells[key].append(ParquetCell(str(file), group, key, place))
-    return rows, cells
-
-
-def _text(value: Any) -> str:
-    return text_of(value[0] if isinstance(value, list) and len(value) == 1 else value)
+def _read(path: Path) -> pa.Table:
+    try:
+        return pq.read_table(path)
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(f"{path} cannot be read ({brief(error)}): fetch the whole dataset") from None

@@ -16,6 +16,7 @@ by object; the authors' notebook (github.com/ligerfotis/mvitac, create_dataset.i
 """
 
 import math
+import random
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,8 +28,6 @@ import numpy as np
 from mvitac.data.source import Sample, Source, one_stamp, stamp_of
 from mvitac.data.spec import PHASES, DataSpec, Task
 from mvitac.datasets.base import KEEPING, DatasetConfig
-from mvitac.datasets.calandra import objects
-from mvitac.datasets.calandra.objects import AUTHORS_TEST, AUTHORS_TRAIN
 from mvitac.registry import check_range, to_json, unknown
 from mvitac.system.files import brief, digest
 
@@ -47,6 +46,47 @@ TASKS = {
 Ask = Literal["during", "before", "after", "authors"]
 
 
+_TEST = """international_travel_adapter 3d_printed_blue_connector soft_zebra fake_flower_in_pot metal_can french_dip
+metal_cylinder_with_holes soft_beer_bottle_holder"""
+_TRAIN = """cinnamon potato aspirin red_turtle happy_fall_stone monster_truck soft_red_cube lime ogx_shampoo peanut_butter
+chocolate_shake webcam_box rubics_cube muffin red_bull purple_small_plastic_fruit onion soft_blue_hexagon plastic_cow
+fox_head small_coffe_cup lemon red_apple 3d_printed_white_ball set_small_plastic_men_police_man dog_toy_ice_cream_cone
+playdoh_container bandaid_box emergency_stop_button_for_sawyer plastic_duck brown_paper_cup_2_upside mentos_gum_can"""
+AUTHORS_TEST, AUTHORS_TRAIN = tuple(_TEST.split()), tuple(_TRAIN.split())
+"""The paper's 40 most attempted objects as listed by its authors (in their spelling)."""
+
+REPAIRS = {
+    "plastic_duc": "plastic_duck",
+    "hair_dryer_": "hair_dryer_spiky_nozzle",
+    "light_blue_": "light_blue_translucent_object",
+    "brown_paper": "brown_paper_bag",
+    "beans_in_pa": "beans_in_paper_container",
+    "shampoo_whi": "shampoo_white_bottle",
+    "small_blue_": "small_blue_plastic_spoon",
+    "dove_deodor": "dove_deodorant",
+    "yellow_bulb": "yellow_bulb_man",
+    "toy_person_with_hat": "set_small_plastic_men_yellow_construction_worker",
+}
+"""Wrong name in some recordings (cut to 11 letters, or another word) -> object, from the owners' scripts."""
+
+
+def repaired(name: bytes | str) -> str:
+    """Return the name in an attribute object_name, repaired."""
+    text = (name.decode() if isinstance(name, bytes) else name).strip(" \0\n\r\t")
+    if not text:
+        raise ValueError("object_name is empty")
+    return REPAIRS.get(text, text)
+
+
+def owners_shuffle(names: Sequence[str], seed: int) -> list[str]:
+    """Shuffle sorted ``names`` like the owners' script: Python 2's random.shuffle after random.seed(seed)."""
+    shuffled, generator = sorted(names), random.Random(seed)
+    for i in reversed(range(1, len(shuffled))):
+        j = int(generator.random() * (i + 1))
+        shuffled[i], shuffled[j] = shuffled[j], shuffled[i]
+    return shuffled
+
+
 @dataclass(frozen=True, kw_only=True)
 class CalandraConfig(DatasetConfig):
     """Grasps of about 106 objects with two GelSights (stacked, 6 channels) and a Kinect, labelled by success."""
@@ -56,8 +96,6 @@ class CalandraConfig(DatasetConfig):
 
     path: Path = Path("data/calandra")
     """Folder with some or all of the shards calandra_corl2017_000.h5 to _037.h5."""
-    shards: tuple[int, ...] = ()
-    """Numbers of the shards to read (0 to 37); default: all in the folder."""
     split: str = "authors"
     """authors: the 32 training and 8 test objects of the paper's authors. object: the owners' split, 75 % of all objects
     in train and 25 % in test, by split_seed. fold:K (K from 0, sorted by name) or fold:NAME: leave this object out."""
@@ -102,7 +140,7 @@ class Calandra(Source):
 
     def __init__(self, config: CalandraConfig) -> None:
         self.config = config
-        self._files = {file: stamp_of(str(file)) for file in find_shards(config.path, config.shards)}
+        self._files = {file: stamp_of(str(file)) for file in find_shards(config.path)}
         everything = [grasp for file in self._files for grasp in list_grasps(file)]
         self._splits = split_objects(config, sorted({grasp.object for grasp in everything if not grasp.damage}))
         # Objects that the split leaves out are not read; damaged grasps are kept, to be listed.
@@ -175,16 +213,12 @@ def _number(file: Path) -> int:
     return int(file.stem[-3:])
 
 
-def find_shards(path: Path, shards: Sequence[int]) -> list[Path]:
-    """Return the shards in folder ``path``, or those in ``shards``; ValueError names what is missing."""
-    if not path.is_dir():
-        raise ValueError(f"{path} is not a folder: give the one with calandra_corl2017_000.h5 and its neighbours")
-    files = {_number(file): file for file in sorted(path.iterdir()) if SHARD.fullmatch(file.name)}
-    missing = [number for number in shards if number not in files]
-    if missing or not files:
-        lacking = f"calandra_corl2017_{missing[0]:03d}.h5" if missing else "calandra_corl2017_NNN.h5"
-        raise ValueError(f"{path} has no {lacking}: download it (doi 10.25532/OPARA-700)")
-    return [files[number] for number in sorted(set(shards) or files)]
+def find_shards(path: Path) -> list[Path]:
+    """Return the shards in folder ``path``."""
+    files = sorted(file for file in path.glob("*.h5") if SHARD.fullmatch(file.name))
+    if not files:
+        raise ValueError(f"{path} has no calandra_corl2017_NNN.h5: download some (doi 10.25532/OPARA-700)")
+    return files
 
 
 def list_grasps(file: Path) -> list[Grasp]:
@@ -197,14 +231,14 @@ def list_grasps(file: Path) -> list[Grasp]:
             indices = sorted(int(name[1:]) for name in data if re.fullmatch(r"i\d+", name))
             return [_describe(data, Grasp(file, _number(file), index)) for index in indices]
     except (OSError, KeyError, RuntimeError, TypeError) as error:  # h5py raises these for damaged files
-        raise ValueError(f"{file} cannot be read ({brief(error)}): download it, or leave it out of shards") from None
+        raise ValueError(f"{file} cannot be read ({brief(error)}): download it again, or remove it") from None
 
 
 def _describe(data: Any, grasp: Grasp) -> Grasp:
     try:
         attributes = data[f"i{grasp.index}"].attrs
         name, gripping = (np.asarray(attributes[key]).item() for key in ("object_name", "is_gripping"))
-        return replace(grasp, object=objects.repaired(name), gripping=bool(gripping))
+        return replace(grasp, object=repaired(name), gripping=bool(gripping))
     except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
         return replace(grasp, damage=f"attributes cannot be read ({brief(error)})")
 
@@ -229,7 +263,7 @@ def split_objects(config: CalandraConfig, names: Sequence[str]) -> dict[str, str
         splits = {name: "train" for name in names if name in AUTHORS_TRAIN}
         splits |= {name: "test" for name in names if name in AUTHORS_TEST}
     elif config.split == "object":
-        shuffled = objects.owners_shuffle(names, config.split_seed)
+        shuffled = owners_shuffle(names, config.split_seed)
         num_train = int(0.75 * len(shuffled))
         splits = {name: "train" if i < num_train else "test" for i, name in enumerate(shuffled)}
     else:

@@ -1,3 +1,0 @@
-"""Reads LeRobot datasets."""
-
-from mvitac.datasets.lerobot import reader as reader
