@@ -97,7 +97,7 @@ class Presses(Source):
         if fault == "labels" and item % 30 == 1:
             columns["label_material"] = -1
         if fault == "unseen class":
-            columns["label_material"] = 2 if held_out else obj % 2
+            columns["label_material"] = 2 if held_out else obj // 4 % 2
         if fault == "sensor":
             columns["sensor"] = f"lab {material}"
         if fault == "names of groups":  # 2022_000101 is a recording, though Python reads a number in it
@@ -166,7 +166,7 @@ FAULTS = {
     "half bgr": ("red and blue swapped", "look", "160 of 320 (50.0 %)"),
     "swapped": ("vision and touch swapped", "look", ", of object object 7"),
     "offset": ("time offset between streams", "look", "touch comes 2 rows late"),
-    "unseen class": ("classes of material", "broken", "tested but never seen in training: cloth"),
+    "unseen class": ("labels of material", "broken", "tested but never seen in training: cloth"),
     "copies": ("identical images across splits", "broken", "vision: 5 of 320"),
     "near-copies": ("near-copies across splits", "look", "vision: 16 of"),
     "leak": ("groups across splits", "broken", "e.g. 'object 0'; 1 of 5 in test are also in train"),
@@ -175,8 +175,8 @@ FAULTS = {
         "look",
         r"group: 'OBJECT\xa003' and 'object 3'",
     ),
-    "labels": ("missing labels", "look", "first 00-01"),
-    "sensor": ("sensors", "look", "sensor alone predicts material with 100 % accuracy"),
+    "labels": ("labels of material", "look", "first 00-01"),
+    "sensor": ("columns that give a label away", "look", "sensor predicts material with 100 % accuracy"),
     "give-away": ("columns that give a label away", "look", "force predicts material with 91 % accuracy"),
 }
 
@@ -223,7 +223,7 @@ def test_a_part_of_a_source_proves_no_class_unseen(tmp_path: Path) -> None:
     for num, verdict in ((0, "ok"), (12, "look")):
         findings = examine_source(source, num=num, size=16, quiet=True)
         assert f"{num or 60} of 60 items examined" in findings[0].evidence
-        found = {f.item: f for f in findings}["classes of label"]
+        found = {f.item: f for f in findings}["labels of label"]
         assert found.verdict == verdict and exit_code(findings) <= ("ok", "look").index(verdict)
     assert found.evidence.startswith("in the items examined: 10 classes") and "never seen in training" in found.evidence
 
@@ -326,7 +326,7 @@ def test_what_cannot_be_checked_is_said_and_costs_nothing(tmp_path: Path) -> Non
     pack = build(TouchOnly(), tmp_path / "p", size=SIDE, quiet=True)
     findings = {f.item: f for f in examine(pack)}
     cannot = {item for item, f in findings.items() if f.verdict == "not checkable"}
-    assert cannot == {"vision and touch swapped", "time offset between streams", "sensors"}
+    assert cannot == {"vision and touch swapped", "time offset between streams"}
     assert "touch 2: all in one order" in findings["red and blue swapped"].evidence
     assert exit_code(findings.values()) == 0
 
@@ -380,10 +380,9 @@ def test_a_task_is_judged_by_its_own_split(tmp_path: Path) -> None:
             return [replace(sample, columns={**sample.columns, **own})]
 
     findings = {f.item: f for f in examine(build(Otherwise(), tmp_path / "p", size=SIDE, quiet=True))}
-    assert findings["classes of rough"].verdict == "ok"
-    assert "always saying 'smooth' scores 50.0 % on test" in findings["classes of rough"].evidence
-    assert "rough: 11 of 75 (14.7 %) in test, first 09-09" in findings["missing labels"].evidence
-    assert {f.item for f in findings.values() if f.verdict in ("look", "broken")} == {"missing labels"}
+    assert "always saying 'smooth' scores 50.0 % on test" in findings["labels of rough"].evidence
+    assert "; 11 of " in findings["labels of rough"].evidence and "first 09-09" in findings["labels of rough"].evidence
+    assert {f.item for f in findings.values() if f.verdict in ("look", "broken")} == {"labels of rough"}
     assert findings["groups across column split_rough"].evidence.startswith("none of group")
 
 

@@ -54,7 +54,7 @@ def examine(pack: Pack, *, part: bool = False, window: Window = SINGLE) -> list[
     frames is checked, too.
     """
     looks = look_at(pack)
-    labels = [table_checks.missing_labels(pack), *table_checks.class_balance(pack), *value_checks.values(pack)]
+    labels = [*table_checks.labels(pack), *value_checks.values(pack)]
     if part:
         note = "in the items examined: "
         milder = [replace(f, verdict="look", evidence=note + f.evidence) for f in labels]
@@ -67,7 +67,6 @@ def examine(pack: Pack, *, part: bool = False, window: Window = SINGLE) -> list[
         image_checks.swapped_modalities(pack, looks),
         image_checks.time_offset(pack, looks),
         *([value_checks.time_shift(pack, looks)] if pack.spec.values else []),
-        table_checks.sensors(pack),
         *labels,
         *table_checks.ungrouped(pack),
         *table_checks.leaks(pack),

@@ -34,46 +34,32 @@ def missing_images(pack: Pack) -> Finding:
     return judged("missing images", evidence, advice, look=any(note.startswith("no row") for note in notes))
 
 
-def missing_labels(pack: Pack) -> Finding:
-    """Find rows of train, val and test without a label of their task."""
-    notes, rows, broken = [], [], False
-    for task in pack.spec.tasks:
-        labels = pack.column(f"label_{task.name}")
-        for split in ("train", "val", "test"):
-            asked = pack.rows(split, only=task.only, by=task.split)
-            empty = asked[labels[asked] < 0]
-            broken |= len(asked) == len(empty) and split != "val"
-            if len(empty) or (not len(asked) and split != "val"):
-                first = f", first {pack.column('id')[empty[0]]}" if len(empty) else ""
-                notes.append(f"{task.name}: {share(len(empty), len(asked))} in {split}{first}")
-            rows += empty.tolist()
-    advice = "fill them in, or move the rows to split unlabelled; fine if they are meant for pre-training only"
-    evidence = "; ".join(notes) or "none in train, val and test"
-    return judged("missing labels", evidence, advice, rows, look=bool(notes), broken=broken)
-
-
-def class_balance(pack: Pack) -> list[Finding]:
-    """Find classes that are missing in train or test, and the accuracy of a constant answer, per task."""
+def labels(pack: Pack) -> list[Finding]:
+    """Find rows without a label, classes that are missing in train or test, and uneven classes, per task."""
     findings = []
     for task in pack.spec.tasks:
-        item, counts = f"classes of {task.name}", []
-        for splits in (("train", "val"), ("test",)):
-            found = pack.labels(task.name, *splits)
-            counts.append(np.bincount(found[found >= 0], minlength=len(task.classes)))
-        train, test = counts
-        if not train.sum() or not test.sum():
-            findings.append(Finding(item, "not checkable", "no labels in train or test"))
+        item, found = f"labels of {task.name}", [pack.labels(task.name, *s) for s in (("train", "val"), ("test",))]
+        train, test = (np.bincount(own[own >= 0], minlength=len(task.classes)) for own in found)
+        if not train.any() or not test.any():
+            lacking = "test" if train.any() else "train"
+            findings.append(judged(item, f"none in {lacking}", "label some or assign the splits again", broken=True))
             continue
+        asked = pack.rows("train", "val", "test", only=task.only, by=task.split)
+        empty = asked[pack.labels(task.name)[asked] < 0]
         majority, names = test[train.argmax()] / test.sum(), np.array(task.classes)
-        always = task.classes[train.argmax()]
         unseen, unasked = names[(test > 0) & (train == 0)].tolist(), names[test == 0].tolist()
+        uneven = majority > 0.9 or (majority > 0.75 and len(names) > 2)
+        always = task.classes[train.argmax()]
         evidence = f"{len(names)} classes; always saying {always!r} scores {100 * majority:.1f} % on test"
         evidence += f"; never tested: {listed(unasked, 3)}" if unasked else ""
         evidence += f"; tested but never seen in training: {listed(unseen, 3)}" if unseen else ""
-        skewed = majority > 0.9 or (majority > 0.75 and len(names) > 2)
-        again = "assign the groups to splits again, or drop the classes"
-        advice = again if unseen or unasked else "report balanced accuracy"
-        findings.append(judged(item, evidence, advice, look=bool(unasked) or skewed, broken=bool(unseen)))
+        if len(empty):
+            evidence += f"; {share(len(empty), len(asked))} rows have none, first {pack.column('id')[empty[0]]}"
+        advice = ["assign the groups to splits again, or drop the classes"] * bool(unseen or unasked)
+        advice += ["fill them in; fine if they are meant for pre-training only"] * bool(len(empty))
+        advice += ["report balanced accuracy"] * bool(uneven)
+        look = bool(advice)
+        findings.append(judged(item, evidence, "; ".join(advice), empty.tolist(), look=look, broken=bool(unseen)))
     return findings
 
 
@@ -122,27 +108,8 @@ def ungrouped(pack: Pack) -> list[Finding]:
     return [judged("groups", "; ".join(notes), "pack again with --group COLUMN")] if notes else []
 
 
-def sensors(pack: Pack) -> Finding:
-    """Find sensors that are only in test, or that alone predict a label."""
-    item, names = "sensors", pack.sensor_names
-    if "sensor" not in pack.table.column_names:
-        return Finding(item, "not checkable", "no column sensor")
-    counts = np.bincount(pack.sensors, minlength=len(names))
-    found = listed([f"{names[i]} {100 * counts[i] / pack.num:.0f} %" for i in np.argsort(-counts)], 4)
-    wrong = []
-    if new := np.setdiff1d(pack.sensors[pack.rows("test")], pack.sensors[pack.rows("train")]).tolist():
-        wrong.append(f"{listed([names[i] for i in new], 3)} only in test")
-    for task in pack.spec.tasks:
-        labels = pack.labels(task.name, "train", "val", "test")
-        wrong += _predicts("sensor alone", task.name, pack.sensors[labels >= 0], labels[labels >= 0])
-    advice = "probe each sensor separately, or use the same ones in train and test"
-    return judged(item, "; ".join([found, *wrong]), advice, look=bool(wrong))
-
-
 def _predicts(what: str, task: str, values: np.ndarray, labels: np.ndarray) -> list[str]:
     """Return a note if answering the most frequent label of each value is better than the majority class."""
-    if not len(labels):
-        return []
     majority = np.bincount(labels).max() / len(labels)
     told = sum(np.bincount(labels[values == one]).max() for one in np.unique(values)) / len(labels)
     if told <= majority + 0.1:
@@ -151,10 +118,11 @@ def _predicts(what: str, task: str, values: np.ndarray, labels: np.ndarray) -> l
 
 
 def give_aways(pack: Pack) -> Finding:
-    """Find numeric columns that predict a label: confounds that a control probe should use.
+    """Find columns of numbers, and sensors, that predict a label: confounds that a control probe should use.
 
-    On the labelled rows outside test, the accuracy of the most frequent class in each eighth of the values is compared
-    with that of the majority class. A column that is the label itself (each value one class) or a control is skipped.
+    On the labelled rows outside test, the accuracy of the most frequent class in each eighth of the values (of each
+    sensor) is compared with that of the majority class. A column that is the label itself (each value one class) or a
+    control is skipped.
     """
     notes = []
     other = {"id", *(task.name for task in pack.spec.tasks), *(c for used in pack.spec.controls.values() for c in used)}
@@ -162,16 +130,19 @@ def give_aways(pack: Pack) -> Finding:
     columns = [name for name in pack.table.column_names if not (name in other or name.startswith(PACKED))]
     columns = [name for name in columns if not any((pack.column(name).astype(str) == one).all() for one in names)]
     for task in pack.spec.tasks:
-        labels = pack.labels(task.name, "train", "val")
-        rows, labels = np.flatnonzero(labels >= 0), labels[labels >= 0]
+        found = pack.labels(task.name, "train", "val")
+        rows, found = np.flatnonzero(found >= 0), found[found >= 0]
         for name in columns if len(rows) >= 64 else ():
+            if name == "sensor":
+                notes += _predicts("sensor", task.name, pack.sensors[rows], found)
+                continue
             mine = _numbers(pack.column(name)[rows])
-            if mine is None or not np.isfinite(mine).all() or len(np.unique(mine)) < 2 or _is_label(mine, labels):
+            if mine is None or not np.isfinite(mine).all() or len(np.unique(mine)) < 2 or _is_label(mine, found):
                 continue
             part = np.searchsorted(np.unique(np.quantile(mine, np.arange(1, 8) / 8)), mine)
-            notes += _predicts(name, task.name, part, labels)
+            notes += _predicts(name, task.name, part, found)
     advice = "report them with every score as a control (--controls name=column)"
-    evidence = "; ".join(notes) or "no column of numbers does"
+    evidence = "; ".join(notes) or "no sensor and no column of numbers does"
     return judged("columns that give a label away", evidence, advice, look=bool(notes))
 
 
