@@ -64,13 +64,13 @@ class LeRobotConfig(RecordedConfig):
         cameras = [key for key, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
         names = choose(cameras, self.vision, self.touch, self.path)
         embedded = [key for key in names.values() if info["features"][key]["dtype"] == "image"]
-        rows, cells = self._frames(embedded)
+        rows, cells = self._table(embedded)
         found: Refs = {}
         for column, key in names.items():
             found[column] = cells[key] if key in cells else self._in_videos(info, key, rows)
         return Manifest.of(self.path, rows, found)
 
-    def _frames(self, embedded: Sequence[str]) -> tuple[list[Row], Refs]:
+    def _table(self, embedded: Sequence[str]) -> tuple[list[Row], Refs]:
         """Return the table rows as text, and the references of ``embedded`` images."""
         tasks, rows, cells = _tasks(self.path), list[Row](), Refs()
         for file in sorted((self.path / "data").glob("*/*.parquet")):
