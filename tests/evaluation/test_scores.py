@@ -161,28 +161,6 @@ def test_one_seed_has_no_p() -> None:
     assert paired_difference([record([3], 0)], [record([9], 0)])[1:] == (-1.0, 1.0, None)
 
 
-def test_interval_counts_groups_not_rows() -> None:
-    """Ten times the rows in the same groups say next to nothing new."""
-    few = {"group_sizes": [1] * 20, "group_correct": [1, 0] * 10}
-    many = {"group_sizes": [10] * 20, "group_correct": [10, 0] * 10}
-    assert interval([few]) == pytest.approx(interval([many]), abs=0.01)
-
-
-def test_one_large_group_counts_as_few() -> None:
-    """19 groups of 1 row and one of 981 are little more than one group."""
-    even = {"group_sizes": [50] * 20, "group_correct": [25, 35] * 10}
-    uneven = {"group_sizes": [1] * 19 + [981], "group_correct": [0, 1] * 9 + [0, 590]}
-    assert np.ptp(interval([uneven])[1:]) > 5 * np.ptp(interval([even])[1:])
-
-
-def test_seeds_widen_the_interval() -> None:
-    same, good = record([5] * 50, 0), record([9] * 50, 1)
-    _, low, high = interval([same])
-    assert high - low < 0.1
-    mean, low, high = interval([same, good])
-    assert mean == pytest.approx(0.7) and high - low > 0.8  # t with 1 degree of freedom
-
-
 def test_intervals_stay_within_0_and_1_and_are_never_empty() -> None:
     mean, low, high = interval([record([10] * 6, 0)])
     assert (mean, high) == (1.0, 1.0) and 0.7 < low < 0.9

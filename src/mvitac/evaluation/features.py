@@ -18,12 +18,13 @@ from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.progress import work
 
 
-def sample(rows: np.ndarray, num: int) -> np.ndarray:
-    """Draw at most ``num`` of ``rows`` at random; returns the same rows, in order, on every call.
+def sample(rows: np.ndarray, num: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    """Draw at most ``num`` of ``rows`` at random, in order; without ``rng`` the same rows on every call.
 
     Rows cycle through the classes, so a fixed stride would miss most of them.
     """
-    return np.sort(np.random.default_rng(0).choice(rows, min(num, len(rows)), replace=False))
+    rng = rng or np.random.default_rng(0)
+    return np.sort(rng.choice(rows, min(num, len(rows)), replace=False))
 
 
 def fitting(model: Model, pack: Pack, among: Sequence[str] = MODALITIES) -> tuple[str, ...]:

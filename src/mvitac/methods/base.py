@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
-from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, keep_modes, trunks
+from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, keep_modes
 from mvitac.registry import Registered, check_range
 
 RANGES = {
@@ -130,7 +130,7 @@ class Contrastive(Method):
         return self.contrast(self.queries(batch) | self.keys(batch))
 
     def encoders(self) -> dict[str, nn.Module]:
-        return trunks(self.towers)
+        return {m: tower.trunk for m, tower in self.towers.items()}  # type: ignore[misc]
 
 
 def present(towers: nn.ModuleDict, batch: Views) -> list[tuple[str, nn.Module]]:

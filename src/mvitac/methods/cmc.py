@@ -27,7 +27,7 @@ from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
-from mvitac.nn.encoders import Encoders, build_towers, heads
+from mvitac.nn.encoders import Encoders, build_towers
 from mvitac.nn.memory_bank import Bank
 from mvitac.registry import check_range
 
@@ -133,4 +133,4 @@ class CMC(Contrastive):
         self.z_norm.copy_(norm)
 
     def projectors(self) -> dict[str, nn.Module]:
-        return heads(self.towers)
+        return {m: tower.head for m, tower in self.towers.items()}  # type: ignore[misc]

@@ -36,7 +36,6 @@ from mvitac.nn.encoders import (
     draws_random_numbers,
     features_of,
     num_features,
-    trunks,
 )
 from mvitac.nn.losses import info_nce
 from mvitac.nn.momentum import Momentum
@@ -196,7 +195,7 @@ class MViTac(Contrastive):
         return (*crossed, (0, 0), (1, 1)) if head == "inter" and self.config.pairs == "all" else crossed
 
     def encoders(self) -> dict[str, nn.Module]:
-        return trunks(self.query)
+        return {m: tower.trunk for m, tower in self.query.items()}  # type: ignore[misc]
 
     def projectors(self) -> dict[str, nn.Module]:
         return {m: tower.inter for m, tower in self.query.items()}  # type: ignore[misc]

@@ -17,7 +17,7 @@ from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
-from mvitac.nn.encoders import Encoders, build_towers, heads
+from mvitac.nn.encoders import Encoders, build_towers
 from mvitac.nn.losses import info_nce
 
 
@@ -55,4 +55,4 @@ class SSVTP(Contrastive):
         return {"loss": (vt + tv) / 2, "vt": vt, "tv": tv}
 
     def projectors(self) -> dict[str, nn.Module]:
-        return heads(self.towers)
+        return {m: tower.head for m, tower in self.towers.items()}  # type: ignore[misc]

@@ -288,13 +288,3 @@ def build_towers(config: Encoders, spec: DataSpec, head: Callable[[int], nn.Modu
         trunk = build_trunk(config[modality], spec.channels(modality), spec.frames(modality))
         towers[modality] = Projected(trunk, head(num_features(trunk)))
     return towers
-
-
-def trunks(towers: nn.ModuleDict) -> dict[str, nn.Module]:
-    """modality -> trunk of its tower."""
-    return {m: tower.trunk for m, tower in towers.items()}  # type: ignore[misc]
-
-
-def heads(towers: nn.ModuleDict) -> dict[str, nn.Module]:
-    """modality -> head of its ``Projected`` tower."""
-    return {m: tower.head for m, tower in towers.items()}  # type: ignore[misc]

@@ -18,7 +18,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.several import MixedPack
 from mvitac.data.spec import AnyTask, Task
 from mvitac.evaluation import diagnostics
-from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.features import pack_features, sample
 from mvitac.model import BEST, Model
 from mvitac.run import Run
 from mvitac.training.log import Log
@@ -91,10 +91,10 @@ def _validate(model: Model, pack: Pack, run: Run, locked: Mapping[str, Tensor]) 
 
     rng = np.random.default_rng(0)  # the same rows at every step and for every seed
     modalities = pack.spec.modalities
-    train_rows = _sample(pack.rows("train", "unlabelled", having=modalities), NUM_EVAL_TRAIN, rng)
+    train_rows = sample(pack.rows("train", "unlabelled", having=modalities), NUM_EVAL_TRAIN, rng)
     val_rows = np.setdiff1d(pack.rows("val", having=modalities), run.method.training_rows(pack))
     held_out = len(val_rows) > 1
-    rows = _sample(val_rows, NUM_EVAL_VAL, rng) if held_out else train_rows[:NUM_EVAL_VAL]
+    rows = sample(val_rows, NUM_EVAL_VAL, rng) if held_out else train_rows[:NUM_EVAL_VAL]
     z = {m: read(m, rows) for m in model.encoders if m in modalities}
     values: dict[str, float] = {}
     cells: Cells = {}
@@ -107,10 +107,6 @@ def _validate(model: Model, pack: Pack, run: Run, locked: Mapping[str, Tensor]) 
     if len(model.projectors) == len(z) == 2:
         values |= _shared_space(model, pack, run, rows, z)
     return values, cells
-
-
-def _sample(rows: np.ndarray, num: int, rng: np.random.Generator) -> np.ndarray:
-    return np.sort(rng.choice(rows, min(num, len(rows)), replace=False))
 
 
 def _linear(
