@@ -107,10 +107,6 @@ def test_sensors_are_encoded_one_by_one(pack: Pack, tmp_path: Path) -> None:
     torch.testing.assert_close(model.features("touch", both), torch.cat(each, dim=1))
 
 
-def test_an_encoder_may_read_one_sense() -> None:
-    assert set(open_model(f"{TINY},reads=vision").encoders) == {"vision"}
-
-
 FACTORY = """
 from torch import nn
 

@@ -136,16 +136,6 @@ def test_a_row_may_read_the_same_samples_in_another_way(pack: Pack, tmp_path: Pa
     assert {"MViTac", "darker"} <= sources
 
 
-def test_a_plan_from_a_file(tmp_path: Path) -> None:
-    rows = [{"label": "a"}, {"label": "b", "method": "cmc", "set": {"augment.touch.scale": [0.3, 1.0]}}]
-    value = {"rows": rows, "reference": "a", "set": {"steps": 5}, "data": {"name": "pack", "path": "packs/x"}}
-    (tmp_path / "mine.json").write_text(json.dumps(value))
-    plan = find_plan(str(tmp_path / "mine.json"))
-    assert plan.name == "mine" and plan.data == PackConfig(path=Path("packs/x"))
-    run = plan.run(plan.rows[1], plan.data, 1, phased=False)
-    assert (run.steps, run.method.name, run.augment.touch.scale) == (5, "cmc", (0.3, 1.0))
-
-
 @pytest.mark.parametrize(
     "file", sorted((Path(__file__).parents[2] / "examples").glob("*.toml")), ids=lambda file: file.stem
 )

@@ -142,23 +142,16 @@ def gallery(study: Study) -> list[Markup]:
     names = study.pack.column("group")[rows].astype(str)
     groups = torch.from_numpy(np.unique(names, return_inverse=True)[1])
     labels = study.labels(rows)
-    queries = sample(np.arange(len(rows)), NUM_QUERIES)
+    queries, by, tasks = sample(np.arange(len(rows)), NUM_QUERIES), study.pack.spec.group_by, study.pack.spec.tasks
     halves = []
     for asked, searched in (("touch", "vision"), ("vision", "touch")):
         found = nearest_groups(z[asked], z[searched], groups, labels, queries.tolist())
-        by, num = study.pack.spec.group_by, int(groups.max()) + 1
-        shown = [
-            _strip(
-                study,
-                (asked, searched),
-                rows[query.row],
-                f"its {by} has rank {query.rank} of {num}",
-                [(rows[row], kind) for row, kind in query.found],
-            )
-            for query in found
-        ]
+        shown = []
+        for query in found:
+            rank = f"its {by} has rank {query.rank} of {int(groups.max()) + 1}"
+            hits = [(rows[row], kind) for row, kind in query.found]
+            shown.append(_strip(study, (asked, searched), rows[query.row], rank, hits))
         halves.append(html.card(f"{asked} → {searched}", shown))
-    by, tasks = study.pack.spec.group_by, study.pack.spec.tasks
     intro = (
         f"{len(queries)} test rows drawn at random (seed 0). Left: the query. Then, best first, the five {by}s whose mean"
         f" embedding in the other modality is nearest ({run.source}, {run.path.name})."

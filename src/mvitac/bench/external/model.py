@@ -151,8 +151,6 @@ def _described(part: ExternalEncoder) -> dict[str, Any]:
         "parameters": sum(p.numel() for p in loaded.network.parameters()),
         "features": part.num_features,
         "preprocessing": to_json(part.preprocessing),
-        "sensors": part.sensors,
-        "frames_given": part.frames,
     }
 
 
