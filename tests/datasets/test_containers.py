@@ -311,15 +311,6 @@ def test_a_bad_cell_costs_its_own_row_only(tmp_path: Path) -> None:
     assert [name for name, _ in pack.meta["damaged"]] == ["row 4"]
 
 
-def test_hub_files_name_their_split_all_or_none(tmp_path: Path) -> None:
-    root = make_hub(tmp_path / "data")
-    options: dict[str, Any] = {"path": root, "size": 16, "labels": ("kind",), "group": "thing"}
-    (root / "train-00001-of-00002.parquet").rename(root / "more.parquet")
-    with pytest.raises(ValueError, match=r"column 'split' \(split\) is empty"):
-        FolderConfig(**options).source()
-    assert FolderConfig(**options, split="by-group").source().spec().group_by == "thing"
-
-
 def test_hub_parquet_with_gaps(tmp_path: Path) -> None:
     images = [None if i == 3 else {"bytes": png(i), "path": None} for i in range(20)]
     rows = [{"obs.touch": image, "photo": png(i), "kind": i % 2} for i, image in enumerate(images)]

@@ -6,8 +6,6 @@ import csv
 import json
 import os
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -194,18 +192,6 @@ def test_a_repaired_image_costs_what_comes_from_its_part_on(
     assert (Pack(tmp_path / "p").images["touch"][:, :, :, 0] == 200).all()
 
 
-def test_an_unfinished_pack_of_files_that_have_all_changed_mixes_no_old_pixels(tmp_path: Path) -> None:
-    options = write_plain(tmp_path / "set", 200, 10)
-    bad = tmp_path / "set" / "5.bmp"
-    bad.write_bytes(bytes(bad.stat().st_size))
-    with pytest.raises(ValueError, match="1 of 40 items cannot be read"):
-        packed(options, tmp_path / "p")
-    pack = packed(write_plain(tmp_path / "set", 90, 20), tmp_path / "p")
-    assert (pack.images["touch"][:, :, :, 0] == 90).all()
-    straight = packed(options, tmp_path / "straight")
-    assert (pack.path / "pack.json").read_bytes() == (straight.path / "pack.json").read_bytes()
-
-
 def test_classes_sort_by_name_or_by_number_and_pandas_gaps_do_not_matter(tmp_path: Path, rows: Table) -> None:
     floats = [{**row, "stiffness": float(row["stiffness"]) if row["stiffness"] else float("nan")} for row in rows]
     for suffix in ("csv", "parquet", "jsonl"):
@@ -234,13 +220,6 @@ def test_two_ways_to_type_a_name_are_one(tmp_path: Path, rows: Table) -> None:
     assert pack.spec.tasks[0].classes == ("Nan", "caf\u00e9 au lait") == other.spec.tasks[0].classes
     assert set(pack.column("group")) == {f"tasse {i:03d}" for i in (0, 1, 3, 4, 5, 6, 7)}
     assert pack.digest == other.digest
-
-
-def test_paths_keep_their_bytes(tmp_path: Path, rows: Table) -> None:
-    odd = tmp_path / "vision" / "a\u0308  0.png"
-    (tmp_path / "vision" / "00.png").rename(odd)
-    rows[0]["vision"] = f"vision/{odd.name}"
-    config(write(rows, tmp_path / "m.csv")).source()  # the file is found
 
 
 def test_unlabelled_rows_are_kept_for_pre_training_only(tmp_path: Path, rows: Table) -> None:
@@ -281,11 +260,6 @@ def test_numbers_must_not_take_the_place_of_a_column_of_the_pack(
 def test_a_config_survives_json(tmp_path: Path) -> None:
     run = recipe("smoke", config(tmp_path, controls=("a=b",), only=("seq<=4",), vision=""), phased=False)
     assert from_json(Run, json.loads(json.dumps(to_json(run)))) == run
-
-
-def test_reading_needs_no_torch() -> None:
-    code = "import sys, mvitac.datasets.folder; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 # -- class folders ----------------------------------------------------------------------------------------------------
@@ -619,40 +593,6 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
     for name in ("train/a/1", "test/b/2", "validation/a/3"):
         picture(tmp_path / f"beside/{name}.png")
     refused(tmp_path / "beside", "images in validation beside train, test: rename or remove it")
-
-
-# -- the real sets, where they are ------------------------------------------------------------------------------------
-
-SETS = {
-    "slip_grasp": (
-        1092,
-        {"labels": ("success",), "group": "object", "touch_group": "grasp", "controls": ("width=width_mm",)},
-    ),
-    "slip_gsmini": (1812, {"labels": ("slip",), "group": "object", "only": ("label_conflict!=1",)}),
-    "physiclear": (
-        3797,
-        {"labels": ("material", "hardness", "roughness", "bumpiness"), "group": "object", "split": "by-group"},
-    ),
-}
-
-
-@pytest.mark.parametrize("name", SETS)
-def test_real_sets_read_whole(tmp_path: Path, name: str) -> None:
-    if not (REAL / name / "manifest.csv").is_file():
-        pytest.skip(f"{name} is not beside the project")
-    num, options = SETS[name]
-    options = FolderConfig(path=REAL / name, size=32, **options)
-    source = options.source()
-    assert len(source.items()) == num
-    assert source.spec().name == name
-    few = replace(options, only=(*options.only, "seq=0"))
-    pack = packed(few, tmp_path / "pack")
-    for task in pack.spec.tasks:
-        labels = pack.column(f"label_{task.name}")
-        assert all((labels[pack.rows(split)] >= 0).any() for split in ("train", "test"))
-    groups = {split: set(pack.column("group")[pack.rows(split)]) for split in ("train", "val", "test")}
-    assert not groups["test"] & (groups["train"] | groups["val"])
-    assert all(images.reshape(len(images), -1).std(1).min() > 1 for images in pack.images.values())
 
 
 def test_commands_say_what_a_group_is(tmp_path: Path, rows: Table, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +15,6 @@ from PIL import Image
 from mvitac.bench.suite import find_suite, open_set
 from mvitac.cli.main import main
 from mvitac.data.build import build
-from mvitac.data.images import decode, shrink
 from mvitac.data.pack import Pack
 from mvitac.data.video import num_frames, spread
 from mvitac.datasets.base import DatasetConfig
@@ -294,70 +292,6 @@ def test_vt60_pairs_are_weak_but_right(packs: dict[str, Pack]) -> None:
         assert abs(level(pack.images["touch"][row]) - (100 + 10 * k + i)) < 3
         assert [pack.column(axis)[row] for axis in "xyz"] == [str(42094 + k), f"-{k}", "25275"]
     assert pack.spec.tasks[0].classes == ("01_stapler", "02_bottleempty", "03_ball")
-
-
-# -- genuine images, put back where their owners keep them ------------------------------------------------------------
-
-REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
-
-
-def genuine(name: str) -> list[dict[str, str]]:
-    if not (REAL / name / "manifest.csv").is_file():
-        pytest.skip(f"{name} is not beside the project")
-    with (REAL / name / "manifest.csv").open(newline="") as stream:
-        return list(csv.DictReader(stream))
-
-
-def link(target: Path, source: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.symlink_to(source)
-
-
-def test_genuine_slip_grasp(tmp_path: Path) -> None:
-    rows = genuine("slip_grasp")
-    lines: dict[str, dict[str, str]] = {}
-    for row in rows:
-        folder = row["grasp"].split("_", 1)[1]
-        for kind, column in (("external", "vision"), ("gelsight", "touch")):
-            name = f"{kind}_imgw{folder}_s09_{int(row['frame']):08d}.jpg"
-            link(tmp_path / f"data/object{row['object']}/{folder}_mm" / name, REAL / "slip_grasp" / row[column])
-        word = ("fail", "ok")[int(row["success"])]
-        line = f"{row['width_mm']} {word} {row['success']} 0 0 {row['key_frame']} {folder} _s09_"
-        lines.setdefault(row["object"], {})[folder] = line
-    for name, found in lines.items():
-        (tmp_path / f"data/object{name}_result.dat").write_text("\n".join(found.values()))
-    source = SlipGraspConfig(path=tmp_path, size=32).source()
-    assert len(source.items()) == len(rows) == 1092
-    expected = {(row["grasp"], row["seq"]): row for row in rows}
-    for item in range(0, 1092, 50):
-        (sample,) = source.read(item)
-        row = expected[sample.columns["grasp"], sample.columns["seq"]]
-        assert {k: sample.columns[k] for k in ("success", "frame", "frame_rel_key", "object")} == {
-            k: row[k] for k in ("success", "frame", "frame_rel_key", "object")
-        }
-        assert sample.columns["width_mm"] == float(row["width_mm"])
-        for modality in ("vision", "touch"):
-            assert (getattr(sample, modality) == shrink(decode(REAL / "slip_grasp" / row[modality]), 32)).all()
-
-
-def test_genuine_vt60(tmp_path: Path) -> None:
-    rows = genuine("vt60")
-    numbers: dict[str, int] = {}
-    for row in rows:
-        numbers[row["modality"] + row["object"]] = n = numbers.get(row["modality"] + row["object"], -1) + 1
-        at = f"at_{row['x']}_{row['y']}_{row['z']}"
-        touch = f"touch_{row['touch_group']}_img_{n}_name_{row['name']}_{at}.jpg"
-        vision = f"IMG_inst_{int(row['instance'])}_img_{n}_validframeID_{n}.jpg"
-        name = touch if row["modality"] == "touch" else vision
-        link(tmp_path / "code/data/vt60" / row["modality"] / row["object"] / name, REAL / "vt60" / row["image"])
-    source = VT60Config(path=tmp_path, size=32).source()
-    assert len(source.items()) == 2880
-    assert source.spec().tasks[0].classes == tuple(sorted({row["category"] for row in rows}))
-    (sample,) = source.read(1000)
-    touches = [row for row in rows if row["modality"] == "touch" and row["object"] == sample.columns["object"]]
-    row = touches[int(sample.columns["seq"])]
-    assert [sample.columns[axis] for axis in "xyz"] == [row[axis] for axis in "xyz"]
-    assert (sample.touch == shrink(decode(REAL / "vt60" / row["image"]), 32)).all()
 
 
 def test_the_suite_of_the_bench_reads_the_clones(clones: Path, tmp_path: Path) -> None:

@@ -108,17 +108,6 @@ def test_every_video_is_decoded_once(films: Path, tmp_path: Path, monkeypatch: p
     assert list(source.samples_per_item()) == [4, 4, 4] * 4
 
 
-def test_a_video_may_stand_beside_files(films: Path, tmp_path: Path) -> None:
-    rows = [{"touch": f"{k}/gel.avi", "frame": k, "label": "ab"[k % 2], "take": k} for k in range(4)]
-    rows += [
-        {"touch": plain(films / f"{k}.png", 200), "frame": "", "label": "ab"[k % 2], "take": k} for k in range(4, 8)
-    ]
-    pack = packed(table(films / "mixed.csv", rows), tmp_path / "pack", labels=("label",), group="take")
-    found = [level(image) for image in pack.images["touch"]]
-    assert np.allclose(found[:4], [shade(k, k + 1) for k in range(4)], atol=6)
-    assert found[4:] == [200] * 4
-
-
 def test_no_video_is_split_where_no_group_is_given(films: Path, tmp_path: Path) -> None:
     rows = [{"touch": f"{k}/gel.avi", "frame": i, "label": "ab"[k % 2]} for k in range(4) for i in range(12)]
     rows += [{"touch": plain(films / "alone.png", 200), "frame": "", "label": "a"}]

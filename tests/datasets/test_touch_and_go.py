@@ -16,7 +16,6 @@ import pytest
 from PIL import Image
 
 from mvitac.bench.suite import find_suite, open_set
-from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.video import frames
@@ -201,12 +200,6 @@ def test_stratify_reaches_the_best_where_it_can_be_counted(seed: int) -> None:
     assert dealt.tolist() == [[4, 2, 2]] * 3
 
 
-def test_stratify_of_little_or_nothing() -> None:
-    assert len(stratify(np.zeros((0, 3)), (0.5, 0.5), 0)) == 0
-    assert stratify(np.zeros((4, 3)), (0.5, 0.5), 0).sum() == 2
-    assert stratify(np.array([[5], [5]]), (0.5, 0.5), 3).sum() == 1
-
-
 # -- pairs ------------------------------------------------------------------------------------------------------------
 
 
@@ -232,23 +225,6 @@ def test_jpegs_and_videos_give_the_same_pairs(official: Pack, tmp_path: Path) ->
     check_pairs(pack)
     pixels = ["crc_vision", "crc_touch"]  # which two codecs do not leave alike
     assert pack.table.drop_columns(pixels).equals(official.table.drop_columns(pixels))
-
-
-def test_a_video_is_preferred(tree: Path, tmp_path: Path) -> None:
-    root = shutil.copytree(tree, tmp_path / "both")
-    for name in NAMES:
-        for stem, stream in (("video", "vision"), ("gelsight", "touch")):
-            folder = root / "dataset" / name / f"{stem}_frame"
-            folder.mkdir()
-            for number in range(NUM_FRAMES):  # one more than the video's, to tell the two apart
-                Image.fromarray(numbered(number + 1, stream)).save(folder / f"{number:010d}.jpg", quality=95)
-    before = TouchAndGoConfig(root=root, size=32).source()
-    assert read_number(before.read(0)[0].touch)[0] == 20  # type: ignore[union-attr]
-    for name in NAMES:
-        (root / "dataset" / name / "gelsight.mp4").unlink()
-    after = TouchAndGoConfig(root=root, size=32).source()
-    assert read_number(after.read(0)[0].touch)[0] == 21  # type: ignore[union-attr]
-    assert before.fingerprint() != after.fingerprint()
 
 
 def test_two_workers_give_the_pack_of_one(official: Pack, tree: Path, tmp_path: Path) -> None:
@@ -414,24 +390,6 @@ def test_bad_lists_are_told(tree: Path, tmp_path: Path, name: str, text: str | N
     with pytest.raises(ValueError, match=r"\.txt") as told:
         TouchAndGoConfig(root=tree, lists=tmp_path).source()
     assert expected in str(told.value)
-
-
-# -- the whole road ---------------------------------------------------------------------------------------------------
-
-
-def test_from_the_download_to_a_trained_model(tree: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out, run = tmp_path / "pack", tmp_path / "run"
-    choice = ["--data", "touch-and-go", "--root", str(tree), "--split", "official", "--size", "32"]
-    assert main(["data", "pack", *choice, "--out", str(out), "--quiet"]) == 0
-    told = capsys.readouterr().out
-    assert "239 samples at 32 px" in told and "note: official split: 7 of 7 test recordings are also in train" in told
-    assert main(["data", "info", str(out)]) == 0
-    assert "note: official split" in capsys.readouterr().out
-    steps = ["--recipe", "smoke", "--steps", "2", "--batch-size", "8", "--device", "cpu", "--quiet", "--out", str(run)]
-    assert main(["pretrain", "--data", "pack", "--data.path", str(out), *steps]) == 0
-    assert (run / "model.safetensors").is_file()
-    assert main(["probe", str(run), "--no-controls"]) == 0
-    assert "note: official split" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.skipif(not SAMPLE.is_dir(), reason="the real recordings are not here")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -152,10 +152,3 @@ def test_a_stretch_of_zeros_is_no_contact(healthy: Pack) -> None:
     pack = Pack(healthy.path)
     pack.table = pack.table.set_column(at, "force_n", [force])
     assert "constant" in value_checks.values(pack)[0].evidence
-
-
-def test_tasks_with_other_rows_have_their_own_check(healthy: Pack) -> None:
-    pack = Pack(healthy.path)
-    pack.spec = replace(pack.spec, values=(replace(pack.spec.values[0], only={"group": "3"}),))
-    (force,) = value_checks.values(pack)
-    assert force.verdict == "broken" and "no row of train" in force.evidence
