@@ -53,7 +53,7 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
                 datasets = _datasets(_at(opened, name))
                 refs = _images(file, name, datasets, images, MAX_ROWS - len(rows))
                 num = len(next(iter(refs.values())))
-                cells = _constants(opened, name, vectors, left_out)
+                cells = _constants(opened, name, vectors)
                 cells |= _columns(demo, datasets, num, refs, vectors, left_out)
                 episodes = _episodes(demo, everything.get("meta/episode_ends"), num)
                 for column in {**found, **refs}:
@@ -199,8 +199,8 @@ def _at(opened: Any, name: str) -> Any:
     return opened[name] if name else opened
 
 
-def _constants(opened: Any, name: str, vectors: Collection[str], left_out: LeftOut) -> dict[str, list[str]]:
-    """Return the attributes of group ``name`` and of those above it; the nearest counts."""
+def _constants(opened: Any, name: str, vectors: Collection[str]) -> dict[str, list[str]]:
+    """Return the attributes of group ``name`` and of those above it; the nearest counts. Long texts are left out."""
     cells: dict[str, list[str]] = {}
     # From group to group: the path of each from the root would take minutes where there are thousands.
     for group in accumulate(name.split("/") if name else [], _at, initial=opened):
@@ -208,10 +208,7 @@ def _constants(opened: Any, name: str, vectors: Collection[str], left_out: LeftO
             plain = np.asarray(value).tolist()
             plain = plain[0] if isinstance(plain, list) and len(plain) == 1 else plain
             plain = plain.decode() if isinstance(plain, bytes) else plain
-            long = isinstance(plain, str) and len(plain) > MAX_TEXT
-            if long or (isinstance(plain, list) and column not in vectors):
-                most = f"at most {MAX_TEXT} characters, or one value; of several one is named, {column}[0]"
-                left_out.setdefault(column, f"is an attribute of {len(plain)} parts: a column has {most}")
-            elif isinstance(plain, (str, int, float, list)):
+            left_out = len(plain) > MAX_TEXT if isinstance(plain, str) else column not in vectors
+            if isinstance(plain, (int, float)) or (isinstance(plain, (str, list)) and not left_out):
                 cells[column] = [text_of(plain)]
     return cells

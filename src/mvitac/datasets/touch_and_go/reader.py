@@ -9,8 +9,8 @@ are in the owners' repository (see ``lists.py``). One pack has all three tasks; 
 label -1.
 """
 
+import itertools
 import math
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -154,14 +154,11 @@ class TouchAndGo(Source):
 
 
 def _chunks(frames: Sequence[Frame]) -> list[list[Frame]]:
-    """Divide frames into items: up to ``CHUNK`` frames of one recording, ascending."""
-    by_name: dict[str, list[Frame]] = defaultdict(list)
-    for frame in frames:
-        by_name[frame.recording].append(frame)
-    chunks = []
-    for name in sorted(by_name):
-        own = sorted(by_name[name], key=lambda frame: frame.number)
-        chunks += [own[i : i + CHUNK] for i in range(0, len(own), CHUNK)]
+    """Divide frames, sorted by recording and number, into items: up to ``CHUNK`` frames of one recording."""
+    chunks: list[list[Frame]] = []
+    for _, own in itertools.groupby(frames, key=lambda frame: frame.recording):
+        recording = list(own)
+        chunks += [recording[i : i + CHUNK] for i in range(0, len(recording), CHUNK)]
     return chunks
 
 
