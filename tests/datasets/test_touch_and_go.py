@@ -119,7 +119,7 @@ def test_frames_that_only_the_rough_lists_name_are_hidden_from_all_else() -> Non
     find_touches(listed)
     assign_official(listed, 0, 0)
     pack = object.__new__(Pack)  # the table alone
-    pack.spec = _spec(TouchAndGoConfig(split="official"), (), False)
+    pack.spec = _spec(TouchAndGoConfig(split="official"), True, (), False)
     pack.table, pack.num = pa.Table.from_pylist([_columns(frame, pack.spec) for frame in listed]), len(listed)
     split, touch = pack.column("split"), pack.column("touch_group")
     named = np.array([frame.listed for frame in listed])
@@ -398,6 +398,7 @@ def test_a_real_recording_without_its_camera_video(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"20220319_002026 \(no video\.mp4\)"):
         TouchAndGoConfig(root=SAMPLE, **options).source()
     pack = packed(SAMPLE, tmp_path / "pack", modalities="touch", **options)
+    assert [task.name for task in pack.spec.tasks] == ["category", "soft"]  # the rough lists name no frame of it
     assert pack.num == 76 and set(pack.column("label_category")) == {15}  # the folder's name ends in _rock
     shown = dict(frames(SAMPLE / "20220319_002026_rock" / "gelsight.mp4", pack.column("frame"), 32))
     assert all(np.array_equal(shown[n], pack.images["touch"][i]) for i, n in enumerate(pack.column("frame")))

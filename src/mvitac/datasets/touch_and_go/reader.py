@@ -111,7 +111,8 @@ class TouchAndGo(Source):
         self._stamps = [one_stamp(self._recordings[name].stamps(numbers)) for name, numbers in frames]
         notes = lists.leaks(listed) if config.split == "official" else []
         notes += [lacking] * bool(missing)
-        self._spec = _spec(config, tuple(notes), bool(missing))
+        # A part of the recordings may have no frame of the rough lists.
+        self._spec = _spec(config, any(frame.rough >= 0 for frame in listed), tuple(notes), bool(missing))
         self._fingerprint = {
             "reader": f"touch-and-go {VERSION}",
             "lists": {name: digest_file(self._lists / name) for name in sorted(lists.LIST_FILES)},
@@ -171,26 +172,22 @@ def _columns(frame: Frame, spec: DataSpec) -> dict[str, Any]:
         "frame": frame.number,
         "label_category": frame.category,
         "label_soft": -1 if frame.category < 0 else int(frame.category in lists.SOFT),
-        "label_rough": frame.rough,
     }
-    own = spec.tasks[2].split
-    if own != "split":
-        columns[own] = frame.split_rough
+    for task in spec.tasks[2:]:
+        columns |= {"label_rough": frame.rough, **({task.split: frame.split_rough} if task.split != "split" else {})}
     return columns
 
 
-def _spec(config: TouchAndGoConfig, notes: tuple[str, ...], missing: bool) -> DataSpec:
+def _spec(config: TouchAndGoConfig, rough: bool, notes: tuple[str, ...], missing: bool) -> DataSpec:
     # The rough/smooth lists have another split than the category lists.
     own = "split_rough" if config.split == "official" else "split"
-    hard, rough = (
-        Task(name="soft", classes=("hard", "soft")),
-        Task(name="rough", classes=("smooth", "rough"), split=own),
-    )
+    tasks = [Task(name="category", classes=lists.CLASSES), Task(name="soft", classes=("hard", "soft"))]
+    tasks += [Task(name="rough", classes=("smooth", "rough"), split=own)] * rough
     return DataSpec(
         name=f"touch-and-go ({config.split}{', partial' if missing else ''})",
         vision_channels=3 * (config.modalities != "touch"),
         touch_channels=3 * (config.modalities != "vision"),
-        tasks=(Task(name="category", classes=lists.CLASSES), hard, rough),
+        tasks=tuple(tasks),
         group_by="recording",
         licence="CC BY 4.0 (says its homepage)",
         source=f"Touch and Go, Yang et al., NeurIPS 2022, {HOMEPAGE}",
