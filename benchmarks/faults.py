@@ -60,7 +60,6 @@ COMMANDS = {
     "pretrain": f"pretrain {TRAIN} --checkpoint-every 1 --resume --quiet --out {{out}}/r",
     "finetune": "finetune {base}/run --data pack --data.path {base}/pack --lr 1e-3 --steps 2 --batch-size 8 --quiet --resume"
     " --no-from-scratch --out {out}/f",
-    "adapt": "adapt {base}/run --data pack --data.path {base}/pack --steps 2 --batches 1 --quiet --resume --out {out}/r",
     "probe": "probe {base}/run --probes knn --no-controls --json {out}/scores.json",
     "compare": "compare --plan {base}/plan.json --out {out}/c",
     "publish": "publish {base}/run {out}/a",

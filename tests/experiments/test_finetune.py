@@ -1,4 +1,4 @@
-"""Fine-tuning and adaptation: settings from held-out groups of train alone, exact resumes, ancestors in the leaks."""
+"""Fine-tuning: settings from held-out groups of train alone, exact resumes, ancestors in the leaks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ from mvitac.evaluation.diagnostics import mean_error
 from mvitac.evaluation.evaluate import check_unseen
 from mvitac.evaluation.leaks import UNKNOWN
 from mvitac.evaluation.probe import probe_model
-from mvitac.experiments.adapt import NEW, OLD, Adaptation, adapt
 from mvitac.experiments.finetune import FROZEN, SCRATCH, Finetuning, _start, finetune
 from mvitac.model import load
 from mvitac.nn.encoders import EncoderConfig
@@ -31,7 +30,7 @@ from mvitac.run import load_run
 from mvitac.system.files import read_json
 from mvitac.training.loop import train
 from support.toy import Toy, toy_pack
-from support.training_runs import assert_equal_weights, power_cut, smoke, weights
+from support.training_runs import assert_equal_weights, power_cut, smoke
 
 ASKED = Finetuning(labels=("pattern",), lr=(1e-3, 3e-3), steps=(3,), batch_size=16)
 
@@ -226,82 +225,3 @@ def test_a_leak_of_the_ancestor_stands_beside_the_score(ancestor: Path, pack: Pa
     scratch = tmp_path / "out" / "scratch" / "seed0"  # saw its own train alone, which the other split tests
     with pytest.raises(ValueError, match=r"has seen what .* (\d+) of \1 test rows"):
         check_unseen([scratch], pack, pack.spec.tasks, allow_leak=False)
-
-
-# -- adapt --------------------------------------------------------------------------------------------------------------
-
-
-def adapted(ancestor: Path, new: Pack, out: Path, asked: Adaptation, **options: Any) -> dict[str, Any]:
-    options = {"quiet": True, "say": lambda text: None, **options}
-    return adapt(ancestor, PackConfig(path=new.path), asked, out, **options)
-
-
-@pytest.fixture(scope="module")
-def darker(tmp_path_factory: pytest.TempPathFactory) -> Pack:
-    """A sensor with half the brightness, the same objects."""
-
-    class Darker(Toy):
-        def read(self, item: int) -> Any:
-            (sample,) = super().read(item)
-            assert sample.touch is not None
-            return [replace(sample, touch=sample.touch // 2)]
-
-    return build(Darker(), tmp_path_factory.mktemp("darker") / "pack", size=32, workers=1, quiet=True)
-
-
-def test_before_and_after_are_scored_on_new_and_old_data(
-    ancestor: Path, pack: Pack, darker: Pack, tmp_path: Path
-) -> None:
-    result = adapted(ancestor, darker, tmp_path / "out", Adaptation(steps=1))
-    cells = {(r["data"], r["task"], r["modality"], r["source"]) for r in result["records"]}
-    assert {d for d, *_ in cells} == {NEW, OLD} and len(cells) == len(result["records"])
-    assert (NEW, "R@5", "touch -> vision", "after") in cells
-    old = [r for r in result["records"] if (r["data"], r["modality"], r["source"]) == (OLD, "both", "before")]
-    before = {r["task"]: r for r in old}
-    for record in probe_model(load(ancestor), pack, pack.spec.tasks, ["both"], ["linear"]):
-        assert before[record["task"]]["group_correct"] == record["group_correct"]
-
-
-def test_a_run_in_bf16_adapts(pack: Pack, bare: Pack, tmp_path: Path) -> None:
-    """The precision of most recipes where the processor has it; every processor computes it."""
-    start = train(smoke(pack, eval_every=0, precision="bf16"), tmp_path / "start", quiet=True)
-    adapted(start, bare, tmp_path / "out", Adaptation(steps=2, old=bare.path))
-    assert all(bool(value.isfinite().all()) for value in weights(tmp_path / "out").values())
-
-
-@pytest.fixture(scope="module")
-def bare(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Pack:
-    """The same images without labels."""
-    return Pack(edited(pack, tmp_path_factory.mktemp("bare") / "pack", label_pattern=no_label, label_bright=no_label))
-
-
-def no_label(row: dict[str, Any]) -> int:
-    return -1
-
-
-@pytest.mark.usefixtures("often")
-def test_adapt_killed_and_resumed_equals_straight(ancestor: Path, bare: Pack, tmp_path: Path) -> None:
-    asked = Adaptation(steps=4, old=bare.path)
-    straight = adapted(ancestor, bare, tmp_path / "straight", asked)
-    with power_cut(2), pytest.raises(RuntimeError, match="power cut"):
-        adapted(ancestor, bare, tmp_path / "cut", asked)
-    assert (tmp_path / "cut" / "checkpoint.pt").exists()
-    result = adapted(ancestor, bare, tmp_path / "cut", asked, resume=True)
-    assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
-    assert result["records"] == straight["records"]
-    old, _ = load_run(ancestor)
-    run, record = load_run(tmp_path / "straight")
-    assert run.method == old.method and run.optim.lr == pytest.approx(old.optim.lr / 10)
-    assert record["start"]["taken"] == {"vision": ["trunk", "head"], "touch": ["trunk", "head"]}
-
-
-def test_unlabelled_data_is_scored_by_retrieval(
-    ancestor: Path, bare: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = f"adapt {ancestor} --data pack --data.path {bare.path} --steps 1".split()
-    assert main([*command, "--out", str(tmp_path / "out")]) == 0
-    records = json.loads((tmp_path / "out" / "adapted.json").read_text())["records"]
-    assert {(r["data"], r["task"]) for r in records if r["data"] == NEW} == {(NEW, "R@5")}
-    assert {r["data"] for r in records} == {NEW, OLD}
-    said = capsys.readouterr().out
-    assert "new data: test instances" in said and "R@5, vision" in said and "pattern, both" in said

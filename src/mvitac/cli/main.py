@@ -25,7 +25,6 @@ COMMANDS = {
     "data show": "data:show",
     "pretrain": "pretrain:pretrain",
     "finetune": "finetune:finetune",
-    "adapt": "finetune:adapt",
     "probe": "evaluate:probe",
     "compare": "compare:compare",
     "bench": "bench:bench",
@@ -43,7 +42,7 @@ COMMANDS = {
 """Command -> module of this package:function, imported when called."""
 
 
-HEAVY = ("demo", "pretrain", "finetune", "adapt", "compare", "bench")
+HEAVY = ("demo", "pretrain", "finetune", "compare", "bench")
 """Commands whose options need torch. The others import it once their options are known to be right."""
 
 

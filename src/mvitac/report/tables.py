@@ -178,21 +178,6 @@ def print_finetuning(result: dict[str, Any], file: TextIO | None = None) -> None
     _print_notes(result, result["records"], file)
 
 
-def print_adaptation(result: dict[str, Any], file: TextIO | None = None) -> None:
-    """Print the result of ``experiments.adapt``: a table for each data, before and after."""
-    found: dict[str, dict[str, list[dict[str, Any]]]] = {}
-    for record in result["records"]:
-        found.setdefault(record["data"], {}).setdefault(f"{record['task']}, {record['modality']}", []).append(record)
-    for name, rows in found.items():
-        cells = [[w, _score_text([a]), _score_text([b]), _gain_text([b], [a])] for w, (a, b) in rows.items()]
-        title = f"{name}: test {result['group_by']}s"
-        print(text_table(title, ["score %", "before", "after", "change"], cells), file=file)
-    if not found:
-        print("nothing to score: the data has no labels and no shared space of two modalities", file=file)
-    about = f"95 % intervals: over test {result['group_by']}s only, for this one run; R2 of values, else accuracy."
-    print("\n".join([about, *(f"note: {note}" for note in result["notes"])]), file=file)
-
-
 def text_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1) -> str:
     """A table for the terminal, its first columns ``words`` and the others numbers."""
     align = ["left"] * words + ["right"] * (len(columns) - words)
