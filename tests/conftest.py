@@ -84,11 +84,10 @@ def ctrl_c() -> Iterator[None]:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports with empty figures, for tests of their text: one has up to thirty, each of which takes 0.2 s to draw."""
-    from mvitac.report import figures, galleries
+    from mvitac.report import figures
 
     monkeypatch.setattr(figures, "to_png", lambda figure: b"")
     monkeypatch.setattr(figures, "to_svg", lambda figure: "data:image/svg+xml;base64,")
-    monkeypatch.setattr(galleries, "embed_2d", lambda values: values[:, :2])
 
 
 @pytest.fixture(scope="session")

@@ -91,12 +91,6 @@ def mean_error(scores: Iterable[Sequence[float]]) -> float:
     return float(torch.stack(logs).mean().exp())
 
 
-def group_means(z: Float[Tensor, "N D"], groups: Int[Tensor, " N"]) -> Float[Tensor, "G D"]:
-    """Mean normalised embedding of each group 0 .. G-1, normalised again."""
-    sums = torch.zeros(int(groups.max()) + 1, z.shape[1]).index_add_(0, groups, F.normalize(z.float(), dim=1))
-    return F.normalize(sums, dim=1)
-
-
 def retrieval_ranks(
     query: Float[Tensor, "N D"], gallery: Float[Tensor, "N D"], groups: Int[Tensor, " N"]
 ) -> Int[Tensor, " N"]:
@@ -104,7 +98,9 @@ def retrieval_ranks(
 
     With one gallery entry per group, chance level R@k is exactly k / number of groups.
     """
-    similarity = F.normalize(query.float(), dim=1) @ group_means(gallery, groups).T
+    gallery = F.normalize(gallery.float(), dim=1)
+    sums = torch.zeros(int(groups.max()) + 1, gallery.shape[1]).index_add_(0, groups, gallery)
+    similarity = F.normalize(query.float(), dim=1) @ F.normalize(sums, dim=1).T
     own = similarity.gather(1, groups[:, None])
     # Ties count against the query, or constant embeddings would score.
     return (similarity >= own).sum(1) - 1

@@ -22,7 +22,6 @@ from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import percent
 from mvitac.report.html import COLOURS, CONTROL_GREYS, HUES, MODALITY_HUES, data_uri
 
-MARKERS = ("o", "^", "s", "D", "v", "P", "X", "*")
 DASHES = ("-", "--", ":", "-.")
 
 LEAST = -0.5  # where figures cut off R2, which has no lower limit
@@ -210,33 +209,6 @@ def predicted(title: str, points: Sequence[Sequence[float]], unit: str, hue: str
     axes.grid()
     exact = Line2D([], [], color=COLOURS["soft"], linestyle=DASHES[1], linewidth=1.1)
     legend_below(figure, [exact], ["exact"], 1)
-    return figure
-
-
-@matplotlib.rc_context(STYLE)
-def feature_map(title: str, points: np.ndarray, labels: np.ndarray, classes: Sequence[str]) -> Figure:
-    """Points [N, 2] by label [N] (-1 = unlabelled). Each further eight classes repeat the hues with another marker."""
-    shown = [label for label in range(-1, len(classes)) if (labels == label).any()]
-    longest = max((len(shorten(classes[label], 16)) for label in shown if label >= 0), default=0)
-    columns = 4 if longest <= 10 else 3
-    num_entries = min(len(shown), 40)
-    figure, axes = new_figure(title, 3.5 + 0.16 * -(-num_entries // columns))
-    handles, names = [], []
-    for label in shown:
-        look: dict[str, Any] = {"color": COLOURS["grey3"], "marker": "."}
-        if label >= 0:
-            marker = MARKERS[label // len(HUES) % len(MARKERS)]
-            look = {"color": COLOURS[HUES[label % len(HUES)]], "marker": marker}
-        at = points[labels == label]
-        axes.scatter(at[:, 0], at[:, 1], s=11, alpha=0.8, linewidths=0, **look)
-        if len(handles) < num_entries:
-            handles.append(Line2D([], [], linestyle="", markersize=5, markeredgewidth=0, **look))
-            names.append(shorten(classes[label], 16) if label >= 0 else "no label")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.spines[["top", "right"]].set_visible(True)
-    if classes or len(shown) > 1:
-        legend_below(figure, handles, names, columns)
     return figure
 
 

@@ -16,7 +16,6 @@ from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.run_names import names_of
 from mvitac.evaluation.score_text import WORDS, above, covered, headline, percent, score_name, with_interval
 from mvitac.model import load
-from mvitac.registry import to_json
 from mvitac.report import galleries, score_sections, tables
 from mvitac.report import sections as evidence
 from mvitac.report.html import blocks as page
@@ -93,9 +92,6 @@ def _page(study: Study) -> str:
         "confusion": ("Confusion", evidence.confusions),
         "values": ("Predicted and true values", score_sections.values),
         "mistakes": ("Mistakes and neighbours", galleries.mistakes),
-        "map": ("A map of the features", galleries.feature_maps),
-        "gallery": ("Retrieval gallery", galleries.gallery),
-        "settings": ("Settings", _settings),
         "cost": ("Cost", _cost),
     }
     drawn = []
@@ -172,24 +168,6 @@ def _tile(study: Study, task: str) -> Markup:
     if "balanced" in own:
         ends += f"; balanced {percent(own['balanced'])}"
     return page.tile(task, about, number, ends, verdict, "yes" if found.startswith("above") else "no")
-
-
-def flatten(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings as {"optim.lr": ...}."""
-    flat: dict[str, Any] = {}
-    for key, each in value.items():
-        flat |= flatten(each, f"{prefix}{key}.") if isinstance(each, dict) else {f"{prefix}{key}": each}
-    return flat
-
-
-def _settings(study: Study) -> list[Markup]:
-    each = [flatten(to_json(r.run)) for r in study.runs]
-    names = [f"{r.source}, seed {r.run.seed}" for r in study.runs]
-    rows = [
-        [key, *(str(flat.get(key, "")) for flat in each)] for key in dict.fromkeys(k for flat in each for k in flat)
-    ]
-    shown = page.table(["", *names], rows, words=True, label="settings")
-    return [page.fold("Every setting", shown)]
 
 
 def _cost(study: Study) -> list[Markup]:
