@@ -202,5 +202,6 @@ def outline(work: Work) -> list[str]:
     lines += [f"  left out: {label} ({reason})" for label, reason in work.left_out.items()]
     todo = [job for job in work.jobs if not job.done]
     for asked, run in {job.run.precision: job.run for job in todo}.items():
-        lines.append(f"on this machine: {Hardware.choose(pick_device(run.device), asked).sentence}")
+        if asked != "auto":  # which each run measures when it begins
+            lines.append(f"on this machine: {Hardware.choose(pick_device(run.device), asked).sentence}")
     return [*lines, f"{len(todo)} runs left" if todo else "all runs are finished"]

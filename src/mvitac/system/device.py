@@ -67,10 +67,8 @@ class Hardware:
             return cls(device, asked, f"precision: {asked}{emulated if asked == 'bf16' and not own else ''}")
         if not own:
             return cls(device, "fp32", f"precision: fp32 (auto, as this {kind} does not compute bf16 itself)")
-        if device.type != "cpu":
+        if device.type != "cpu" or not work:
             return cls(device, "bf16", "precision: bf16 (auto)")
-        if not work:
-            return cls(device, "bf16", "precision: auto, bf16 or fp32, whichever each run finds faster at its start")
         slower = slowdown(device, work)
         precision = "bf16" if slower < WORTH else "fp32"
         return cls(device, precision, f"precision: {precision} (auto: bf16 takes {slower:.2f} of fp32's time)", slower)
