@@ -459,19 +459,6 @@ def test_names_and_units_are_text_in_latex_and_markdown() -> None:
     assert pipes(["a|b"], [["c|d"]], words=1) == [r"| a\|b |", "|---|", r"| c\|d |", ""]
 
 
-def test_a_control_of_one_probe_is_one_line_of_the_csv(done: tuple[Path, dict]) -> None:
-    """Pixels, border and majority are scored linearly, whatever else trunks are probed by."""
-    _, result = done
-    plan = {**result["plan"], "probes": ["linear", "knn"]}
-    near = [{**r, "probe": "knn"} for r in result["records"] if r["source"] in ("MViTac", "colder", "untrained")]
-    rows = list(csv.DictReader(comma({**result, "plan": plan, "records": result["records"] + near}).splitlines()))
-    found = [(r["row"], r["probe"], r["modality"], r["task"]) for r in rows]
-    assert len(set(found)) == len(found)
-    probes = {name: {r["probe"] for r in rows if r["row"] == name} for name in {r["row"] for r in rows}}
-    assert probes["pixels"] == probes["majority"] == probes["noise only"] == {"linear"}
-    assert probes["MViTac"] == {"linear", "knn"} and probes["supervised, touch, end to end"] == {"own"}
-
-
 # -- the command: killed and resumed, several at once -----------------------------------------------------------------
 
 
