@@ -36,7 +36,7 @@ class Optim:
     weight_decay: float = 0.0
     """L2 penalty (adam, sgd) or decoupled weight decay (adamw). The paper gives none."""
     decay_norms: Fixed[bool] = True
-    """Also decay biases and the parameters of BatchNorm. Current practice is not to."""
+    """Also decay biases and the parameters of normalisation layers. Current practice is not to."""
     schedule: Literal["constant", "cosine", "step", "late-step"] = "constant"
     """constant; cosine, to zero; step, x0.9 every 10 epochs from epoch 10 on; or late-step, the same from epoch 20 on (the
     authors' StepLR, which is stepped from epoch 10 on). The paper gives none."""

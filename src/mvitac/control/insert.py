@@ -1,5 +1,3 @@
-# mujoco is a binary module without stubs:
-# pyright: reportAttributeAccessIssue=false
 """Put a peg into a slot: only the gel shows how it is held, with which offset and turn; only the camera shows the slot.
 
 The hand moves in the plane of the gel: x to the right, z up, and a turn about the pad's normal. Its height follows a fixed
@@ -9,6 +7,9 @@ a shroud hides the peg from it.
 
 Units: metres and radians inside, mm and degrees in names and results.
 """
+
+# mujoco is a binary module without stubs:
+# pyright: reportAttributeAccessIssue=false
 
 import math
 from collections.abc import Sequence

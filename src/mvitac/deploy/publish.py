@@ -1,4 +1,4 @@
-"""Publish runs: fit the probes on a finished run's data, write one artifact folder, and push it to the Hub."""
+"""Publish runs: fit the probes on a finished run's data, and write one artifact folder."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -107,8 +107,9 @@ class Method(nn.Module, ABC):
 class Contrastive(Method):
     """A method whose losses use only tensors that are computed separately for each pair.
 
-    It implements three functions instead of ``forward``. The training step can then embed a batch in chunks (gradient
-    caching) or on several processes (all-gathered negatives), and compute the loss over all of it (``training/step.py``).
+    It implements ``queries`` and ``contrast`` instead of ``forward``, and may add ``keys``. The training step can then
+    embed a batch in chunks (gradient caching) or on several processes (all-gathered negatives), and compute the loss over
+    all of it (``training/step.py``).
     """
 
     towers: nn.ModuleDict

@@ -1,5 +1,3 @@
-# mujoco is a binary module without stubs:
-# pyright: reportAttributeAccessIssue=false
 """A camera that uses MuJoCo's ray casting (no OpenGL) and its own shading: lamp, shadow, gloss, print, table and wall.
 
 Only the object and the gripper's pose carry information. Viewpoint, lamp, colours, table, wall and clutter are random in
@@ -7,6 +5,9 @@ each grasp and independent of the outcome.
 
 Shapes: P rays (pixels times samples). Colours are linear RGB in [0, 1] until the last step. Units: metres, radians.
 """
+
+# mujoco is a binary module without stubs:
+# pyright: reportAttributeAccessIssue=false
 
 from typing import Any
 

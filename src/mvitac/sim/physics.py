@@ -1,9 +1,10 @@
-# mujoco is a binary module without stubs:
-# pyright: reportAttributeAccessIssue=false
 """Simulates one grasp in MuJoCo: settle, close, lift, hold. The scene is returned at three moments, to be rendered.
 
 Frames and units as in :mod:`mvitac.sim.objects`: metres, kilograms, newtons, radians, seconds.
 """
+
+# mujoco is a binary module without stubs:
+# pyright: reportAttributeAccessIssue=false
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

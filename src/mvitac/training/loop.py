@@ -110,8 +110,8 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
             lr = run.optim.rate(at, num_steps, at // steps_per_epoch)
             losses = step(chunks, lr=lr, seed=mix(run.seed, at) + 1, progress=done / num_steps)
 
-            # Log the losses and check that they are finite. In a step without a save or an evaluation nothing else waits for the GPU, so do this only
-            # every log_every steps, and once early, so that the speed is known soon.
+            # Log the losses and check that they are finite. This waits for the GPU, as only saves and evaluations do
+            # besides, so it is done every log_every steps, and once early, so that the speed is known soon.
             early = done - start == EARLY < run.log_every
             report = done % run.log_every == 0 or last or early
             if report:

@@ -79,8 +79,8 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     before = start.sensors if start and "touch" in taken["taken"] else ()
     spec = replace(pack.spec, sensors=tuple(sorted({*sensors_of(pack, rows), *before})))
     setup = Setup(run, pack, rows, hardware, world, method, views, step, done, kept, spec)
-    # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
     world.same_everywhere([*method.parameters(), *method.buffers()])
+    world.wait()  # rank 0 writes run.json only after all processes have looked for it
     if world.writes:
         _record(setup, asked, out, start, taken, quiet=quiet)
     return setup

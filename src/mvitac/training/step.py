@@ -4,8 +4,8 @@ A batch comes as chunks: functions that create its views, the same ones at each 
 the plain step. Otherwise it is gradient caching (Gao et al., arXiv:2101.06983): each chunk is embedded without a graph, the
 losses are computed over all embeddings at once, then each chunk is embedded again and receives its gradient. The batch, and
 with it the number of negatives, can thus have any size in the memory of one chunk. The gradient is that of the whole batch,
-up to rounding (tests/training/test_step.py). BatchNorm normalises each chunk by its own statistics, as it does per GPU, and
-its running statistics are updated once per chunk.
+up to rounding (tests/training/test_step.py). BatchNorm normalises each chunk by its own statistics (on
+several GPUs by those of that chunk on all of them), and its running statistics are updated once per chunk.
 """
 
 from collections.abc import Callable, Sequence
@@ -129,7 +129,7 @@ def build_optimiser(config: Optim, method: Method, encoders: Encoders) -> torch.
     fused = all(p.device.type in ("cpu", "cuda") and p.is_floating_point() for p in parameters)
     scales = _scales(method, encoders)
     groups: dict[tuple[float, bool], list[Tensor]] = {}
-    for p in parameters:  # biases and the parameters of BatchNorm are vectors
+    for p in parameters:  # biases and the parameters of normalisation layers are vectors
         groups.setdefault((scales.get(id(p), 1.0), p.ndim > 1 or config.decay_norms), []).append(p)
     given = [
         {"params": found, "lr_scale": scale, "weight_decay": config.weight_decay * decayed}
