@@ -154,11 +154,8 @@ def test_shows_every_score_of_the_probe(materials: Path, result: dict[str, Any])
 
 def test_verdict_and_figures_carry_the_numbers(materials: Path, result: dict[str, Any]) -> None:
     page = Page((materials / "out" / "report.html").read_text())
-    for source, name in (("mvitac", "reaches"), ("untrained", "untrained trunk"), ("pixels", "pixels")):
-        mean = result["summary"]["category"]["both"][source]["mean"]
-        assert f"{name} {100 * mean:.1f}" in page.text
     drawn = {path.name for path in (materials / "out" / "figures").iterdir()}
-    assert {"probe-category.png", "loss.png", "confusion-soft.png", "retrieval.png"} <= drawn
+    assert {"probe-category.png", "loss.png", "confusion-soft.png"} <= drawn
     assert len(page.images("svg+xml")) == len(drawn)
     assert "Every class of category, by touch + vision" in page.text
     assert verdicts(result["summary"]["category"])[0].partition(": ")[2] in page.text.replace("\xa0", " ")
@@ -184,7 +181,7 @@ def test_a_mistake_is_nearest_to_another_class(tmp_path: Path) -> None:
     assert near.tolist() == [[2, 3], [2, 3], [1, 0], [2, 1]]  # never of the own group; lengths do not matter
     run, _ = noise(tmp_path, Noise())
     html = write_report([run], tmp_path / "out", quiet=True).read_text()
-    html = html[html.index('<h2 id="mistakes">') : html.index('<h2 id="cost">')]
+    html = html[html.index('<h2 id="mistakes">') :]
     strips = html.split('<div class="query">')[1:]
     assert 2 <= len(strips) <= 16 and re.search(r"touch: \d+ of 24 rows", html)
     for strip in strips:
@@ -203,7 +200,6 @@ def test_hostile_names_stay_text(tmp_path: Path) -> None:
     assert HOSTILE in page.text  # the data's source
     assert page.text.count(HOSTILE[:15]) > 16  # the class name, in figures and below pictures
     assert any(HOSTILE in (image["alt"] or "") for image in page.all("img"))
-    assert str(run) in page.text
     widths = {int(image["width"] or 0) for image in page.images("jpeg")}
     assert widths == {16, 32}  # two gels stand side by side
 
@@ -213,7 +209,7 @@ def test_touch_alone(tmp_path: Path) -> None:
     run, _ = noise(tmp_path, Noise(vision=0))
     page = Page(write_report([run], tmp_path / "out", quiet=True).read_text())
     assert "Not scored: it takes a space that both modalities share" in page.text
-    assert "Touch reaches" in page.text
+    assert "mvitac by touch: interval" in page.text
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -221,7 +217,7 @@ def test_without_labels(tmp_path: Path) -> None:
     run, _ = noise(tmp_path, Noise(labelled=False))
     page = Page(write_report([run], tmp_path / "out", quiet=True).read_text())
     assert "Scores of the frozen features" not in page.text
-    assert "finds its thing among the first five by camera" in page.text
+    assert "Nothing is scored on this data" in page.text and "Given one image, find its thing" in page.text
     assert len(page.images("jpeg")) == 2 * 8 * 6  # eight rows with five others, of each sense
 
 
@@ -236,8 +232,8 @@ def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
     assert "The same by logistic regression" in page.text
     assert "parts of the loss, mvitac" in page.text
     linear, nearest = (summarise(result["records"], kind)["kind"]["both"] for kind in ("linear", "knn"))
-    assert f"with supervised, mvitac {100 * nearest['mvitac']['mean']:.1f}" in page.text
-    assert cell_text({"both": linear}, "mvitac", "both") in page.text.replace("\xa0", " ")
+    for cells in (linear, nearest):
+        assert cell_text({"both": cells}, "mvitac", "both") in page.text.replace("\xa0", " ")
     assert not page.all("script")
     alone = Page(write_report([first], tmp_path / "alone", quiet=True).read_text())
     assert "Not scored: it takes a space that both modalities share" in alone.text

@@ -1,8 +1,7 @@
-"""The report of finished runs as one HTML page: verdict, tables, curves, pictures, settings, cost. No network."""
+"""The report of finished runs as one HTML page: verdict, tables, curves, pictures. No network."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 from markupsafe import Markup
@@ -10,20 +9,19 @@ from markupsafe import Markup
 from mvitac import __version__
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs, stored_result
-from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import scorable
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.run_names import names_of
-from mvitac.evaluation.score_text import WORDS, above, covered, headline, percent, score_name, with_interval
+from mvitac.evaluation.score_text import WORDS, above, covered, headline, percent, score_name, verdicts, with_interval
 from mvitac.model import load
-from mvitac.report import galleries, score_sections, tables
+from mvitac.report import galleries, score_sections
 from mvitac.report import sections as evidence
 from mvitac.report.html import blocks as page
 from mvitac.report.sections import Finished, Study
-from mvitac.run import load_run, precision_of
+from mvitac.run import load_run
 from mvitac.system.files import write_atomic
-from mvitac.system.progress import duration, shown, work
-from mvitac.training.log import read_log, seconds_of
+from mvitac.system.progress import shown, work
+from mvitac.training.log import read_log
 
 
 def write_report(
@@ -92,7 +90,6 @@ def _page(study: Study) -> str:
         "confusion": ("Confusion", evidence.confusions),
         "values": ("Predicted and true values", score_sections.values),
         "mistakes": ("Mistakes and neighbours", galleries.mistakes),
-        "cost": ("Cost", _cost),
     }
     drawn = []
     with work("drawing the report", len(sections), "sections") as advance:
@@ -120,46 +117,15 @@ def _head(study: Study, title: str) -> Markup:
         "trunk": ", ".join(dict.fromkeys(r.run.encoder.named(modalities) for r in runs)),
         "input": ", ".join(dict.fromkeys(f"{r.run.augment.whole_of(m)} px" for r in runs for m in modalities)),
     }
-    text = "; ".join(clauses(study)) or "nothing is scored on this data"
-    text = f"{text[0].upper()}{text[1:]}."
-    tiles = [_tile(study, task) for task in study.result["summary"]]
+    summary = study.result["summary"]
+    said = verdicts(next(iter(summary.values()))) if summary else ["Nothing is scored on this data"]
+    text = "".join(f"{line}. " for line in said).rstrip()
+    tiles = [_tile(study, task) for task in summary]
     return page.head(title, "Pre-training report", chips, text, tiles)
 
 
-def _headline(study: Study, task: str) -> tuple[str, dict[str, Any], dict[str, Any]]:
-    return headline(study.result["summary"][task], study.sources[0], study.sources)
-
-
-def clauses(study: Study) -> list[str]:
-    """One clause per main result: the first task, and retrieval from touch to vision."""
-    said = []
-    for task in list(study.result["summary"])[:1]:
-        modality, own, controls = _headline(study, task)
-        mark = leak_mark(own.get("leak", ""))
-        names = {"untrained": "untrained trunk", "imagenet": "frozen ImageNet trunk", "start": "frozen start"}
-        beside = [f"{names.get(name, name)} {percent(cell['mean'])}" for name, cell in controls.items()]
-        methods = study.result["summary"][task][modality]
-        others = [f"{s} {percent(methods[s]['mean'])}" for s in study.sources[1:] if s in methods]
-        by = f" with {study.sources[0]}" if others else ""
-        said.append(
-            ", ".join([f"{WORDS[modality]} reaches {_worded(methods, own)}{mark} on {task}{by}", *others, *beside])
-        )
-    found = tables.by_direction(study.result["retrieval"]).get((study.sources[0], "touch -> vision"))
-    if found:
-        said.append(
-            f"a touch finds its {study.pack.spec.group_by} among the first five by camera in"
-            f" {percent(tables.recall(found, 'R@5'))} % (chance {percent(tables.recall(found, 'chance R@5'))})"
-        )
-    return said
-
-
-def _worded(task: dict[str, Any], cell: dict[str, float]) -> str:
-    """'61.6 %', or 'R2 61.6 %' of values."""
-    return f"{'R2 ' * (score_name({'': task}) == 'R2')}{percent(cell['mean'])} %"
-
-
 def _tile(study: Study, task: str) -> Markup:
-    modality, own, controls = _headline(study, task)
+    modality, own, controls = headline(study.result["summary"][task], study.sources[0], study.sources)
     found = above(own, controls)
     verdict = f"interval {found}" if controls else ""
     number, _, ends = with_interval(own["mean"], own["low"], own["high"], own.get("leak", "")).partition(" ")
@@ -168,28 +134,3 @@ def _tile(study: Study, task: str) -> Markup:
     if "balanced" in own:
         ends += f"; balanced {percent(own['balanced'])}"
     return page.tile(task, about, number, ends, verdict, "yes" if found.startswith("above") else "no")
-
-
-def _cost(study: Study) -> list[Markup]:
-    rows: dict[str, list[str]] = {}
-    for r in study.runs:
-        lines = [entry for entry in r.log if "loss" in entry]
-        steps, seconds = lines[-1]["step"] if lines else 0, seconds_of(r.log, r.run.batch_size)
-        trunks = sum(p.numel() for p in r.model.encoders.parameters())
-        heads = sum(p.numel() for p in r.model.projectors.parameters())
-        known: dict[str, str] = {
-            "steps": f"{steps:,}",
-            "pairs seen": f"{steps * r.run.batch_size:,} (the data has {r.record.get('num_pairs', 0):,})",
-            "speed": f"{median(e['pairs_per_s'] for e in lines):,.0f} pairs/s (median)" if lines else "",
-            "wall time": duration(seconds) if seconds else "",
-            "parameters kept": f"{trunks / 1e6:.2f} M in trunks" + (f", {heads / 1e6:.2f} M in heads" if heads else ""),
-            "machine": f"{r.record.get('machine', '')}; device {r.run.device}",
-            "precision": precision_of(r.run, r.record) + " (auto)" * (r.run.precision == "auto"),
-            "commit": str(r.record.get("commit") or "not a git checkout"),
-            "folder": str(r.path),
-        }
-        for name, value in known.items():
-            rows.setdefault(name, []).append(value)
-    names = [f"{r.source}, seed {r.run.seed}" for r in study.runs]
-    shown = page.table(["", *names], [[name, *values] for name, values in rows.items()], words=True, label="cost")
-    return [page.paragraph("Wall time is estimated from the logged speeds and excludes the final scoring."), shown]

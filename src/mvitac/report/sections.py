@@ -12,7 +12,6 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from mvitac.data.pack import Pack
-from mvitac.evaluation.intervals import interval
 from mvitac.evaluation.retrieval import MIN_GALLERY, retrieved_rows
 from mvitac.evaluation.score_text import WORDS, headline
 from mvitac.model import Model
@@ -75,25 +74,18 @@ class Study:
 
 
 def retrieval(study: Study) -> list[Markup]:
-    """R@5 as bars with chance level, and the whole table."""
+    """Recall of both directions, and what chance gives."""
     found = study.result["retrieval"]
     if not found:
         needs = f"a space that both modalities share and {MIN_GALLERY} test {study.pack.spec.group_by}s with both"
         return [html.paragraph(f"Not scored: it takes {needs}.")]
-    groups: dict[str, dict[str, dict[str, float]]] = {}
-    for (source, direction), records in tables.by_direction(found).items():
-        mean, low, high = interval(records)
-        groups.setdefault(direction, {})[source] = {"mean": mean, "low": low, "high": high}
     by, num = study.pack.spec.group_by, found[0]["num_groups"]
-    title = f"R@5 over {num} {tables.unseen_groups(by, found)}"
-    drawing = figures.bars(title, groups, {"chance": found[0]["chance R@5"]}, f"own {by} among the first five, %")
-    drawn = study.figure("retrieval", drawing, f"{title}, with chance; the numbers are in the table")
     rows = [[row[0], row[1].replace("->", "→"), *row[2:]] for row in tables.retrieval_rows(found)]
     muted = {row[0] for row in rows} - set(study.sources)
     columns = ["", "query → found", *(f"{k} %" for k in tables.RETRIEVAL)]
     shown = html.table(columns, rows, muted=muted, label="retrieval")
     intro = f"Given one image, find its {by} among {num}, each represented by its mean embedding in the other modality."
-    return [html.paragraph(intro), html.grid([drawn, shown], "beside")]
+    return [html.paragraph(intro), shown]
 
 
 _NOT_LOSS = ("step", "lr", "pairs_per_s", "loss", "eval")
