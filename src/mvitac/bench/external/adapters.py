@@ -14,19 +14,22 @@ taken. The dict has fields of ``Preprocessing``, and "title", "licence", "source
 """
 
 import importlib
+import math
+import re
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
+import torch.nn.functional as F
 from timm.data.config import resolve_data_config
+from timm.data.constants import IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD
 from torch import Tensor, nn
 
-from mvitac.bench.external.preprocessing import Preprocessing
 from mvitac.nn import imagenet
 from mvitac.nn.encoders import IMAGENET, SCRATCH, EncoderConfig, build_trunk
 from mvitac.nn.weights import said_trained_on
@@ -36,22 +39,41 @@ from mvitac.system.files import brief
 START = "external:"
 UNKNOWN, NOTHING, RANDOM = "unknown", "nothing", "none (random weights)"
 ABOUT = ("title", "licence", "source", "trained_on")
-SETS = {
-    "in1k": "ImageNet-1k",
-    "in12k": "ImageNet-12k",
-    "in21k": "ImageNet-21k",
-    "in22k": "ImageNet-22k",
-    "dino": "ImageNet-1k",
-    "mae": "ImageNet-1k",
-    "openai": "OpenAI's image-text pairs",
-    "laion400m": "LAION-400M",
-    "laion2b": "LAION-2B",
-    "datacomp1b": "DataComp-1B",
-    "webli": "WebLI",
-    "lvd142m": "LVD-142M",
-    "lvd1689m": "LVD-1689M",
-}
-"""Parts of timm's tags for weights -> what they were trained on."""
+WEB = re.compile(r"in\d+k|dino|mae|openai|laion\w+|datacomp1b|webli|lvd\d+m")
+"""Parts of timm's tags for weights that name images of the web, which no tactile set is from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preprocessing:
+    """From frames to a network's input. All values are RGB in [0, 1] until ``mean`` and ``std``."""
+
+    size: tuple[int, int] = (224, 224)
+    """Height and width of the input."""
+    mean: tuple[float, float, float] = IMAGENET_DEFAULT_MEAN
+    std: tuple[float, float, float] = IMAGENET_DEFAULT_STD
+    frames: int = 1
+    """Frames that the network sees at once, stacked on channels: [N, 3 F, H, W]."""
+    stride: float = 1.0
+    """Distance of two frames, in units of the data's order column."""
+
+    def __post_init__(self) -> None:
+        if min(*self.size, self.frames) < 1 or not 0 < min(self.stride, *self.std) < math.inf:
+            raise ValueError(f"size {self.size}, frames {self.frames}, stride {self.stride}, std {self.std}: 0 or less")
+
+    def input_shape(self) -> tuple[int, ...]:
+        """Shape of the network's input, for one image."""
+        return (3 * self.frames, *self.size)
+
+    def __call__(self, images: Tensor) -> Tensor:
+        """Prepare images [N, F, 3, H, W], uint8 or float in [0, 1], newest first.
+
+        Missing older frames are the oldest there is; further ones are left out.
+        """
+        images = images[:, [min(f, images.shape[1] - 1) for f in range(self.frames)]]
+        x = images.float() / 255 if images.dtype == torch.uint8 else images.float()
+        x = F.interpolate(x.flatten(0, 1), self.size, mode="bilinear", antialias=True).unflatten(0, images.shape[:2])
+        mean, std = (x.new_tensor(values).view(3, 1, 1) for values in (self.mean, self.std))
+        return ((x - mean) / std).flatten(1, 2)
 
 
 @dataclass(frozen=True)
@@ -77,10 +99,6 @@ class Adapter(ABC):
     """The images that it encodes."""
     size: int | None = None
     """Side of the input."""
-    mean: str = ""
-    """Three numbers: 0.5/0.5/0.5."""
-    std: str = ""
-    """Likewise."""
     title: str = ""
     """Name in tables."""
     licence: str = ""
@@ -93,18 +111,6 @@ class Adapter(ABC):
     @abstractmethod
     def load(self) -> Loaded:
         """Open the encoder; ValueError in one line if ``place`` is something else."""
-
-    def changed(self, made: Preprocessing) -> Preprocessing:
-        """``made`` with the values that options give."""
-        changes: dict[str, Any] = {"size": (self.size, self.size)} if self.size is not None else {}
-        for name in ("mean", "std"):
-            if text := getattr(self, name):
-                try:
-                    red, green, blue = map(float, text.split("/"))
-                except ValueError:
-                    raise ValueError(f"{name} {text!r}: give 3 numbers with '/' between them") from None
-                changes[name] = red, green, blue
-        return replace(made, **changes)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,8 +152,7 @@ class Timm(Adapter):
 
 def said(tag: str) -> str:
     """What timm's tag of pretrained weights says of their data."""
-    found = dict.fromkeys(SETS[part] for part in tag.split("_") if part in SETS)
-    return f"{', '.join(found)} (timm's tag {tag})" if found else UNKNOWN
+    return f"timm's {tag}" if any(map(WEB.fullmatch, tag.split("_"))) else UNKNOWN
 
 
 @dataclass(frozen=True, kw_only=True)
