@@ -13,7 +13,7 @@ from torch import Tensor
 import mvitac
 from mvitac.bench.external import ExternalModel, open_model
 from mvitac.bench.external.adapters import Preprocessing
-from mvitac.bench.external.model import is_noncommercial, open_encoder, randomised
+from mvitac.bench.external.model import is_noncommercial, randomised
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
@@ -52,7 +52,7 @@ def weights(tmp_path: Path) -> Path:
 
 
 def test_random_weights_for_the_control_leave_the_encoder_as_it_is(weights: Path) -> None:
-    found = open_encoder(f"external:timm/test_resnet,weights={weights},size=32")
+    found = open_model(f"external:timm/test_resnet,weights={weights},size=32").part
     before = {name: value.clone() for name, value in found.loaded.network.state_dict().items()}
     untrained = found.untrained()
     assert untrained is not None and untrained.loaded.trained_on == "nothing"
@@ -60,7 +60,7 @@ def test_random_weights_for_the_control_leave_the_encoder_as_it_is(weights: Path
     again = randomised(found.loaded.network, 0).state_dict()
     for name, value in untrained.network.state_dict().items():
         assert torch.equal(value, again[name]) and (value.ndim < 2 or not torch.equal(value, before[name]))
-    assert open_encoder(TINY).untrained() is None
+    assert open_model(TINY).untrained() is None
 
 
 def test_the_same_network_gives_the_same_features_as_in_a_run(pack: Pack, tmp_path: Path) -> None:

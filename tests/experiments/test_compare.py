@@ -205,7 +205,7 @@ def test_changed_fields_are_checked() -> None:
 
 def test_result_and_tables_agree(done: tuple[Path, dict]) -> None:
     out, result = done
-    ends = ("md", "tex", "csv", "pattern.png", "bright.png")
+    ends = ("md", "tex", "csv")
     assert {p.name for p in out.glob("table.*")} == {f"table.{end}" for end in ends}
     lines = {(line.source, line.modality): line for line in lines_of(result)}
     touch = lines["MViTac", "touch"].cells["pattern"]

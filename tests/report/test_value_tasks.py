@@ -131,8 +131,6 @@ def test_one_test_group_of_values_alone(tmp_path: Path) -> None:
     assert "balanced accuracy" not in page and "Confusion" not in page
     rows = csv.reader(io.StringIO(table_formats.comma(compared(stored))))
     assert not any(value in ("inf", "-inf", "nan") for row in rows for value in row)
-    axes = table_formats.figure(lines_of(compared(stored)), "light", "R2").axes[0]
-    assert axes.get_yticklabels()[0].get_text() == "mvitac" and axes.get_xlabel().startswith("R2 %")
 
 
 def test_tables_of_a_comparison_have_a_table_of_targets(scored: tuple[Path, Pack, dict[str, Any]]) -> None:

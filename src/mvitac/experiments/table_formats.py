@@ -1,4 +1,4 @@
-"""The table of a comparison as Markdown, LaTeX, CSV and a figure."""
+"""The table of a comparison as Markdown, LaTeX and CSV."""
 
 import csv
 import io
@@ -9,14 +9,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
 from tabulate import tabulate
 
 from mvitac.evaluation.intervals import least_p, num_groups_of
 from mvitac.evaluation.score_text import covered, error_text, percent, pipes, with_interval
-from mvitac.experiments.plan import Plan, slug
+from mvitac.experiments.plan import Plan
 from mvitac.experiments.table import Line, as_printed, lines_of, plan_of, target_lines
-from mvitac.report.figures import bars, to_png
 from mvitac.report.tables import RETRIEVAL, probe_name, retrieval_rows
 from mvitac.system.files import write_atomic, write_json
 
@@ -25,25 +23,13 @@ VALUES = ("score", "target", "unit", "mae", "rmse")  # columns of the CSV if the
 
 
 def write_tables(result: dict[str, Any], out: Path) -> list[Path]:
-    """Write result.json, table.md, table.tex, table.csv and a figure of each task into ``out``; returns their paths."""
+    """Write result.json, table.md, table.tex and table.csv into ``out``; returns their paths, the Markdown's first."""
     write_json(out / "result.json", result)
     lines = lines_of(result)
     texts = {"md": markdown(result, lines), "tex": latex(result, lines), "csv": comma(result)}
-    files = {f"table.{kind}": text.encode() for kind, text in texts.items()}
-    for task, score in _columns(lines).items():
-        files[f"table.{slug(task)}.png"] = to_png(figure(lines, task, score), dpi=110)
-    for name, content in files.items():
-        write_atomic(out / name, lambda file, content=content: file.write(content))
-    return [out / name for name in (*files, "result.json")]
-
-
-def figure(lines: Sequence[Line], task: str, score: str) -> Figure:
-    """One column of the table as bars."""
-    groups: dict[str, dict[str, Any]] = {}
-    for line in (line for line in lines if task in line.cells):
-        groups.setdefault(line.modality, {})[line.source] = line.cells[task]
-    same = {source: cell["mean"] for source, cell in groups.pop("none", {}).items()}
-    return bars(task, groups, same, f"{score} %, mean and 95 % interval", width=7, length=48)
+    for kind, text in texts.items():
+        write_atomic(out / f"table.{kind}", lambda file, text=text: file.write(text.encode()))
+    return [*(out / f"table.{kind}" for kind in texts), out / "result.json"]
 
 
 def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:

@@ -1,4 +1,4 @@
-"""Figures of the report and of ``mvitac compare``, drawn with matplotlib as PNG or SVG in the page's colours.
+"""Figures of the report, drawn with matplotlib as PNG or SVG in the page's colours.
 
 No pyplot: no global state, nothing to close.
 """
@@ -23,6 +23,7 @@ from mvitac.evaluation.score_text import percent
 from mvitac.report.html import COLOURS, CONTROL_GREYS, HUES, MODALITY_HUES, data_uri
 
 DASHES = ("-", "--", ":", "-.")
+BELOW: Any = "outside lower center"  # of legends, where they hide nothing
 
 LEAST = -0.5  # where figures cut off R2, which has no lower limit
 NUM_NUMBERED = 20  # largest number of classes of a confusion matrix with numbers
@@ -43,29 +44,17 @@ def shorten(text: str, length: int) -> str:
     return text if len(text) <= length else text[: length - 1] + "…"
 
 
-def legend_below(figure: Figure, handles: Sequence[Any], labels: Sequence[str], columns: int) -> None:
-    """Put a legend below the axes, where it hides nothing."""
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns)
-
-
 @matplotlib.rc_context(STYLE)
 def bars(
-    title: str,
-    groups: Mapping[str, Mapping[str, Mapping[str, Any]]],
-    lines: Mapping[str, float],
-    what: str,
-    *,
-    width: float = WIDTH,
-    length: int = 22,
+    title: str, groups: Mapping[str, Mapping[str, Mapping[str, Any]]], lines: Mapping[str, float], what: str
 ) -> Figure:
     """Horizontal bars in percent with 95 % whiskers. Methods have their modality's colour, controls are grey.
 
     ``groups``: modality or direction -> source -> mean, low and high, at most 1; ``low`` None: no whisker. ``lines``
-    are vertical ones across all groups, such as majority or chance. ``what`` labels the axis. Names of sources have at
-    most ``length`` characters.
+    are vertical ones across all groups, such as majority or chance. ``what`` labels the axis.
     """
     num_rows = sum(len(group) + 1.25 for group in groups.values())
-    figure, axes = new_figure(title, 0.85 + 0.21 * num_rows, width)
+    figure, axes = new_figure(title, 0.85 + 0.21 * num_rows)
     y, ticks, spans, top = 0.0, {}, [], max([0.0, *lines.values()])
     lows = [cell[k] for group in groups.values() for cell in group.values() for k in ("mean", "low")]
     least = max(LEAST, min(0.0, *(low for low in lows if low is not None)))
@@ -78,7 +67,7 @@ def bars(
         for source, cell in cells.items():
             y += 1
             _bar(axes, y, source, cell, hue, least)
-            ticks[y] = shorten(source, length)
+            ticks[y] = shorten(source, 22)
             top = max(top, cell["high"])
         y += 1.25
     axes.set_yticks(list(ticks), list(ticks.values()), color=COLOURS["ink"])
@@ -96,7 +85,7 @@ def bars(
         handles.append(Line2D([], [], **look))
         labels.append(f"{shorten(name, 28)} {percent(value)}")
     if handles:
-        legend_below(figure, handles, labels, 3)
+        figure.legend(handles, labels, loc=BELOW, ncols=3)
     return figure
 
 
@@ -155,7 +144,7 @@ def curves(
         axes.set_ylim(bottom=0)
     axes.set(xlabel=x, ylabel=y)
     labels = [shorten(label, 30) for label in handles]
-    legend_below(figure, list(handles.values()), labels, 2 if max(map(len, labels)) > 18 else 3)
+    figure.legend(list(handles.values()), labels, loc=BELOW, ncols=2 if max(map(len, labels)) > 18 else 3)
     return figure
 
 
@@ -208,7 +197,7 @@ def predicted(title: str, points: Sequence[Sequence[float]], unit: str, hue: str
         axis.set_major_locator(MaxNLocator(5))
     axes.grid()
     exact = Line2D([], [], color=COLOURS["soft"], linestyle=DASHES[1], linewidth=1.1)
-    legend_below(figure, [exact], ["exact"], 1)
+    figure.legend([exact], ["exact"], loc=BELOW)
     return figure
 
 

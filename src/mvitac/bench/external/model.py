@@ -229,15 +229,11 @@ def is_noncommercial(licence: str) -> bool:
     return "nc" in licence.lower().split(" (")[0].replace("_", "-").split("-")
 
 
-def open_encoder(text: str) -> ExternalEncoder:
-    """Open the encoder that ``text`` names (``base``); ValueError if that is not possible."""
+def open_model(text: str) -> ExternalModel:
+    """Open the encoder that ``text`` names; ValueError if that is not possible."""
     adapter = parse(text)
     loaded = adapter.load()
     given = {name: getattr(adapter, name) for name in ("licence", "trained_on") if getattr(loaded, name) == UNKNOWN}
     given["title"] = adapter.title
-    return ExternalEncoder(adapter, replace(loaded, **{name: value for name, value in given.items() if value}))
-
-
-def open_model(text: str) -> ExternalModel:
-    """Open the encoder that ``text`` names; ValueError if there is none."""
-    return ExternalModel(text, open_encoder(text))
+    loaded = replace(loaded, **{name: value for name, value in given.items() if value})
+    return ExternalModel(text, ExternalEncoder(adapter, loaded))
