@@ -32,7 +32,7 @@ from mvitac.model import Model, fresh
 from mvitac.nn.linear_probe import Error
 from mvitac.recipes import recipe
 from support.processes import begin, finish
-from support.toy import reordered, toy_pack
+from support.toy import renumbered, toy_pack
 
 EXACT = {"min_cosine": 0.9999, "accuracy_loss": 0.0}
 
@@ -204,7 +204,7 @@ def test_a_corrupted_graph_leaves_no_export(
 
 def test_accuracy_is_of_classes_by_name(model: Model, pack: Pack) -> None:
     """The pack that checks may number them otherwise, and may lack a task."""
-    graph, other = ExportModule(model), reordered(pack)
+    graph, other = ExportModule(model), renumbered(pack, "checks", "rows", "columns")
     found = check(model, graph, other)["accuracy"]
     assert found == check(model, graph, pack)["accuracy"] and set(found) == {"pattern", "bright"}
     assert found["pattern"]["original"] == 100 * model.probes["pattern.both"].info.accuracy

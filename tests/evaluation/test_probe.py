@@ -17,9 +17,7 @@ import torch
 from sklearn.linear_model import LogisticRegression
 
 from mvitac.cli.main import main
-from mvitac.data.build import build
 from mvitac.data.pack import Pack
-from mvitac.data.source import Sample
 from mvitac.data.spec import DataSpec
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation import features as features_module
@@ -44,7 +42,7 @@ from mvitac.system.device import Hardware
 from mvitac.system.files import read_json
 from mvitac.training import setup
 from mvitac.training.loop import train
-from support.toy import Toy, toy_pack
+from support.toy import Toy, renumbered, toy_pack
 
 
 @pytest.fixture(scope="module")
@@ -245,40 +243,19 @@ def test_a_model_of_both_senses_is_probed_on_one(tmp_path: Path) -> None:
     assert [r["modality"] for r in found] == ["touch"]
 
 
-@dataclasses.dataclass
-class Renumbered(Toy):
-    """The toy, its patterns listed in another order, as ``classes``; others have no label."""
+def test_a_runs_own_classifier_answers_by_the_names_of_classes(pack: Pack) -> None:
+    model = fresh(replace(recipe("smoke", PackConfig(path=pack.path)), method=SupervisedConfig()), pack.spec, pack.size)
 
-    classes: tuple[str, ...] = ("checks", "columns", "rows")
-
-    def spec(self) -> DataSpec:
-        spec = super().spec()
-        return replace(spec, tasks=(replace(spec.tasks[0], classes=self.classes),))
-
-    def read(self, item: int) -> list[Sample]:
-        (sample,) = super().read(item)
-        name = Toy().spec().tasks[0].classes[sample.columns["label_pattern"]]
-        label = self.classes.index(name) if name in self.classes else -1
-        return [replace(sample, columns={**sample.columns, "label_pattern": label})]
-
-
-def test_a_runs_own_classifier_answers_by_the_names_of_classes(tmp_path: Path) -> None:
-    plain = toy_pack(tmp_path / "plain", num=60)
-    run = replace(recipe("smoke", PackConfig(path=plain.path)), method=SupervisedConfig())
-    model = fresh(run, plain.spec, plain.size)
-
-    def own(pack: Pack) -> list[dict]:
-        found = probe_model(model, pack, pack.spec.tasks[:1], ["both"], ["knn"])
+    def own(*classes: str) -> list[dict]:
+        other = renumbered(pack, *classes)
+        found = probe_model(model, other, other.spec.tasks[:1], ["both"], ["knn"])
         return [r for r in found if r["probe"] == "own"]
 
-    turned = build(Renumbered(num=60), tmp_path / "turned", size=32, quiet=True)
-    assert own(turned)[0]["group_correct"] == own(plain)[0]["group_correct"]
-    fewer = build(Renumbered(num=60, classes=("rows", "columns")), tmp_path / "fewer", size=32, quiet=True)
-    assert np.sum(own(fewer)[0]["confusion"]) == own(fewer)[0]["num_test"]  # asked among these two
-    more = build(
-        Renumbered(num=60, classes=("waves", *plain.spec.tasks[0].classes)), tmp_path / "m", size=32, quiet=True
-    )
-    assert own(more) == []  # it was never told of waves
+    names = pack.spec.tasks[0].classes
+    assert own("checks", "columns", "rows")[0]["group_correct"] == own(*names)[0]["group_correct"]
+    (fewer,) = own("rows", "columns")
+    assert np.sum(fewer["confusion"]) == fewer["num_test"]  # asked among these two
+    assert own("waves", *names) == []  # it was never told of waves
 
 
 def test_runs_on_different_data_are_not_mixed(runs: list[Path], tmp_path: Path) -> None:

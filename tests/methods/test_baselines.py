@@ -277,12 +277,6 @@ def test_vicreg_weighs_its_terms() -> None:
 # -- supervised references --------------------------------------------------------------------------------------------
 
 
-def test_supervised_on_one_modality(pack: Pack) -> None:
-    assert set(SupervisedConfig(modalities=("vision",)).build(pack.spec, TINY).encoders()) == {"vision"}
-    with pytest.raises(ValueError, match="unknown modality"):
-        SupervisedConfig(modalities=("vision",)).build(Toy(vision_channels=0).spec(), TINY)
-
-
 @pytest.mark.parametrize("config", [SupervisedConfig, CalandraConfig])
 def test_supervised_learns_the_labels_that_probes_are_fitted_on(pack: Pack, config: type) -> None:
     """Also of a task with a split of its own, as rough of Touch and Go's lists, and of rows without the other sense."""

@@ -17,11 +17,10 @@ from mvitac.nn.encoders import Encoders
 from mvitac.recipes import with_method
 from mvitac.registry import default, from_json, to_json
 from mvitac.run import Optim
-from mvitac.training.loop import train
 from mvitac.training.step import build_optimiser
 from support.small_methods import TINY_VIT, build, outcome, small, views
 from support.toy import Toy
-from support.training_runs import assert_equal_weights, power_cut, smoke
+from support.training_runs import smoke, train_twice
 
 NAMES = sorted(MethodConfig.choices)
 PAIRED = ("cmc", "mct", "ssvtp")
@@ -121,15 +120,10 @@ def test_resumed_equals_straight_and_loads(pack: Pack, tmp_path: Path, name: str
     """Cut after step 3 of 4 and resumed: queues, banks and their constants come back with the weights."""
     run = with_method(smoke(pack, steps=4, checkpoint_every=2, eval_every=0), name)
     run = replace(run, encoder=TINY_VIT) if run.method.needs_vit else run
-    train(run, tmp_path / "straight", quiet=True, validate=False)
-    with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
-        train(run, tmp_path / "cut", quiet=True, validate=False)
-    train(run, tmp_path / "cut", resume=True, quiet=True, validate=False)
-    assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
+    model = load(train_twice(run, tmp_path, cut=3, validate=False))
     checkpoints = [torch.load(tmp_path / place / "checkpoint.pt")["method"] for place in ("straight", "cut")]
     for key, value in checkpoints[0].items():
         assert torch.equal(value, checkpoints[1][key]), key
-    model = load(tmp_path / "cut")
     assert set(model.encoders) == {"vision", "touch"}
 
 

@@ -21,19 +21,14 @@ from mvitac.run import Optim
 from mvitac.training.loop import train
 from mvitac.training.views import values_of
 from support.small_methods import TINY
-from support.training_runs import assert_equal_weights, power_cut, smoke
+from support.training_runs import smoke, train_twice
 
 
 def test_heads_alone_leave_the_trunks_as_they_were(pack: Pack, tmp_path: Path) -> None:
     """Weights and statistics of BatchNorm; from another run's weights it is a linear probe."""
     method = SupervisedConfig(train="head", share=0.7)
     run = smoke(pack, method=method, steps=6, checkpoint_every=2, eval_every=0, optim=Optim(name="adamw", lr=3e-3))
-    train(run, tmp_path / "straight", quiet=True)
-    with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
-        train(run, tmp_path / "cut", quiet=True)
-    train(run, tmp_path / "cut", resume=True, quiet=True)
-    assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
-    start, end = fresh(run, pack.spec, pack.size), load(tmp_path / "cut")
+    start, end = fresh(run, pack.spec, pack.size), load(train_twice(run, tmp_path, cut=3))
     before, after = start.encoders.state_dict(), end.encoders.state_dict()
     assert all(torch.equal(value, after[name]) for name, value in before.items())
     heads = zip(start.classifiers.parameters(), end.classifiers.parameters(), strict=True)

@@ -34,23 +34,24 @@ def test_is_fp32_under_autocast() -> None:
     assert float(inside) == float(info_nce(q.float(), k.float(), 0.07))
 
 
-CHANNELS_LAST = torch.channels_last
-
-
-@pytest.mark.parametrize("same", [True, False])
 @pytest.mark.parametrize("stride", [1, 2])
-@pytest.mark.parametrize("kernel", [3, 5])
-@pytest.mark.parametrize("side", [(1, 1), (2, 2), (3, 4), (7, 8)])
-def test_depthwise_equals_the_convolution_and_its_gradients(
-    side: tuple[int, int], kernel: int, stride: int, same: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("kind", "kernel"), [("Product", 3), ("Depthwise", 3), ("Depthwise", 5), ("DepthwiseSame", 3), ("DepthwiseSame", 5)]
+)
+@pytest.mark.parametrize("side", [(1, 1), (2, 2), (3, 1), (3, 4), (7, 8)])
+def test_equals_the_convolution_and_its_gradients(
+    side: tuple[int, int], kind: str, kernel: int, stride: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("mvitac.nn.small_conv.MAX_PIXELS", 64)
     monkeypatch.setattr("mvitac.nn.small_conv.MAX_PIXELS_DEPTHWISE", {3: 64, 5: 64})
-    shape = (6, 6, kernel, stride, 0 if same else kernel // 2)
-    theirs = (Conv2dSame if same else nn.Conv2d)(*shape, groups=6, bias=False)
+    out, groups, dtype = (7, 1, torch.float64) if kind == "Product" else (6, 6, torch.float32)
+    same = kind == "DepthwiseSame"
+    shape = (6, out, kernel, stride, 0 if same else kernel // 2)
+    theirs = (Conv2dSame if same else nn.Conv2d)(*shape, groups=groups, bias=False).to(dtype)
     ours = use_products(nn.Sequential(copy.deepcopy(theirs))).get_submodule("0")
-    images = torch.randn(4, 6, *side).to(memory_format=CHANNELS_LAST).requires_grad_()
+    images = torch.randn(4, 6, *side, dtype=dtype).to(memory_format=torch.channels_last).requires_grad_()
     got, want = ours(images), theirs(images)
-    assert "Depthwise" in type(got.grad_fn).__name__
+    assert kind.removesuffix("Same") in type(got.grad_fn).__name__
     torch.testing.assert_close(got, want)
     towards = torch.randn_like(want)
     mine = torch.autograd.grad(got, (images, *ours.parameters()), towards)
@@ -58,39 +59,21 @@ def test_depthwise_equals_the_convolution_and_its_gradients(
     assert type(use_convolutions(nn.Sequential(ours)).get_submodule("0")) is type(theirs)
 
 
-def layer(stride: int, dtype: torch.dtype = torch.float32) -> SmallMapConv2d:
-    torch.manual_seed(0)
-    conv = nn.Conv2d(5, 7, 3, stride, padding=1, bias=False, dtype=dtype)
-    return use_products(nn.Sequential(conv)).to(memory_format=CHANNELS_LAST)[0]  # type: ignore[index, return-value]
-
-
-@pytest.mark.parametrize("stride", [1, 2])
-@pytest.mark.parametrize("side", [(1, 1), (2, 2), (3, 3), (2, 4), (3, 1), (5, 4)])
-def test_equals_the_convolution_and_its_gradients(
-    side: tuple[int, int], stride: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("mvitac.nn.small_conv.MAX_PIXELS", 20)
-    conv = layer(stride, torch.float64)
-    images = torch.randn(4, 5, *side, dtype=torch.float64).to(memory_format=CHANNELS_LAST).requires_grad_()
-    asked, want = conv(images), F.conv2d(images, conv.weight, stride=stride, padding=1)
-    assert asked.grad_fn is not None and "Product" in type(asked.grad_fn).__name__
-    torch.testing.assert_close(asked, want)
-    towards = torch.randn_like(want)
-    mine = torch.autograd.grad(asked, (images, conv.weight), towards)
-    theirs = torch.autograd.grad(want, (images, conv.weight), towards)
-    torch.testing.assert_close(mine, theirs)
+def layer() -> SmallMapConv2d:
+    conv = nn.Conv2d(5, 7, 3, padding=1, bias=False)
+    return use_products(nn.Sequential(conv)).to(memory_format=torch.channels_last)[0]  # type: ignore[index, return-value]
 
 
 def test_gradients_have_the_weights_layout() -> None:
-    conv = layer(1)
-    conv(torch.randn(4, 5, 2, 2).to(memory_format=CHANNELS_LAST)).square().sum().backward()
+    conv = layer()
+    conv(torch.randn(4, 5, 2, 2).to(memory_format=torch.channels_last)).square().sum().backward()
     assert conv.weight.grad is not None
     assert conv.weight.grad.stride() == conv.weight.stride()  # the fused optimiser reads both as they lie in memory
 
 
 def test_bf16_autocast_is_as_close_as_the_convolution() -> None:
-    conv = layer(1)
-    images = torch.randn(4, 5, 2, 2).to(memory_format=CHANNELS_LAST)
+    conv = layer()
+    images = torch.randn(4, 5, 2, 2).to(memory_format=torch.channels_last)
     want = F.conv2d(images, conv.weight, padding=1)
     with torch.autocast("cpu", torch.bfloat16):
         got = conv(images)

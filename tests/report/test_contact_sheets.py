@@ -1,7 +1,5 @@
 """The contact sheet: every class there, groups spread, each pixel where its row says, gaps shown as gaps."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The report: its numbers are the probe's, its marks are true, it asks nothing of the network, it bears odd input."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """Tasks with values on the terminal, in the report and in comparisons: R2, errors in the unit, pictures, odd cases."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

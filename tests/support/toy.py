@@ -109,12 +109,13 @@ class Counting(Toy):
         return super().read(item)
 
 
-def reordered(pack: Pack) -> Pack:
-    """``pack``, its patterns numbered the other way round."""
+def renumbered(pack: Pack, *classes: str) -> Pack:
+    """``pack``, its patterns listed as ``classes``; rows of any other have no label."""
     other = copy.copy(pack)
     first, *rest = pack.spec.tasks
-    other.spec = replace(pack.spec, tasks=(replace(first, classes=first.classes[::-1]), *rest))
-    at, labels = pack.table.column_names.index("label_pattern"), NUM_CLASSES - 1 - pack.column("label_pattern")
+    other.spec = replace(pack.spec, tasks=(replace(first, classes=classes), *rest))
+    numbers = np.array([classes.index(name) if name in classes else -1 for name in first.classes])
+    at, labels = pack.table.column_names.index("label_pattern"), numbers[pack.column("label_pattern")]
     other.table = pack.table.set_column(at, "label_pattern", pa.array(labels))
     return other
 

@@ -68,6 +68,18 @@ def assert_equal_weights(a: Path, b: Path) -> None:
         assert torch.equal(value, second[name]), name
 
 
+def train_twice(run: Run, folder: Path, *, cut: int, **options: bool) -> Path:
+    """Train ``folder``/straight, and ``folder``/cut, which dies after ``cut`` batches and is resumed: the same weights bit
+    for bit. The latter is returned."""
+    straight, resumed = folder / "straight", folder / "cut"
+    train(run, straight, quiet=True, **options)
+    with power_cut(cut), pytest.raises(RuntimeError, match="power cut"):
+        train(run, resumed, quiet=True, **options)
+    train(run, resumed, resume=True, quiet=True, **options)
+    assert_equal_weights(straight, resumed)
+    return resumed
+
+
 def stopped_at_four(pack: Path, out: Path) -> None:
     """Train in ``out`` until Ctrl-C comes in step 4, and print what is said then."""
 

@@ -1,8 +1,5 @@
-"""What `--precision auto` becomes, what is said and kept of it, and that a CPU without bf16 trains in fp32."""
+"""What `--precision auto` becomes on which machine, and what is said and kept of it."""
 
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -29,8 +26,6 @@ from mvitac.training.loop import train
 from support.training_runs import assert_equal_weights, power_cut, smoke
 
 CPU = torch.device("cpu")
-OLD_CPU = {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2", "MKL_ENABLE_INSTRUCTIONS": "AVX2"}
-"""What makes torch treat any x86 CPU as one that has AVX2 and nothing newer."""
 Machine = Callable[[bool], None]
 
 
@@ -171,14 +166,3 @@ def test_a_bf16_export_needs_a_cpu_that_can_check_it(
     with pytest.raises(ValueError, match="--precision bf16: this CPU does not compute bf16 itself"):
         export(mvitac.load(smoke_run), pack, tmp_path / "e", ExportConfig(precision="bf16"))
     assert not (tmp_path / "e").exists()
-
-
-# -- a CPU without bf16 -----------------------------------------------------------------------------------------------
-
-
-def test_a_recipe_trains_in_fp32_on_a_cpu_without_bf16(pack: Pack, tmp_path: Path) -> None:
-    words = f"--recipe quick --data pack --data.path {pack.path} --encoder.trunk mvitac_tiny --steps 1 --batch-size 4"
-    command = f"pretrain {words} --augment.size 32 --augment.whole None --eval-every 0 --out {tmp_path / 'r'}".split()
-    environment = {**os.environ, **OLD_CPU}
-    subprocess.run([sys.executable, "-m", "mvitac", *command], env=environment, capture_output=True, check=True)
-    assert load_run(tmp_path / "r")[1]["precision"] == "fp32"

@@ -22,7 +22,7 @@ from mvitac.training.loader import Feed
 from mvitac.training.loop import train
 from support.mixes import Gel, Slice, built, mix_run
 from support.small_methods import build, small
-from support.training_runs import assert_equal_weights, batches, power_cut, smoke, views_by
+from support.training_runs import assert_equal_weights, batches, smoke, train_twice, views_by
 
 MISSING = sorted(name for name, config in MethodConfig.choices.items() if config.takes_missing)
 PAIRED = ("cmc", "mct", "ssvtp")
@@ -90,12 +90,8 @@ def test_stopped_and_resumed_equals_straight(parts: dict[str, str], tmp_path: Pa
     """With a part that lacks the camera; across a change of epoch; scores of every part are logged."""
     given = (f"{parts['a']}:1", f"{parts['gel']}:2")
     run = mix_run(*given, data={"batches": kind}, steps=8, checkpoint_every=2, log_every=1)
-    straight = train(run, tmp_path / "straight", quiet=True)
-    with power_cut(5), pytest.raises(RuntimeError, match="power cut"):
-        train(run, tmp_path / "cut", quiet=True)
-    train(run, tmp_path / "cut", resume=True, quiet=True)
-    assert_equal_weights(straight, tmp_path / "cut")
-    lines = [json.loads(line) for line in (straight / "log.jsonl").read_text().splitlines()]
+    out = train_twice(run, tmp_path, cut=5)
+    lines = [json.loads(line) for line in (tmp_path / "straight" / "log.jsonl").read_text().splitlines()]
     values = next(line["eval"] for line in reversed(lines) if "eval" in line)
     shown = {"a vision/linear pattern", "a touch/linear a/bright", "a vision->touch R@5", "gel touch/linear pattern"}
     assert shown <= values.keys()
@@ -104,7 +100,7 @@ def test_stopped_and_resumed_equals_straight(parts: dict[str, str], tmp_path: Pa
     assert seen == ({frozenset(("vv", "tt", "vt", "tv")), frozenset(("tt",))} if kind == "one-part" else seen)
     other = mix_run(f"{parts['a']}:1", f"{parts['gel']}:3", data={"batches": kind}, steps=8)
     with pytest.raises(ValueError, match="holds a different run"):
-        train(other, tmp_path / "cut", resume=True, quiet=True)
+        train(other, out, resume=True, quiet=True)
 
 
 def test_views_are_of_the_rows_that_have_the_modality(parts: dict[str, str]) -> None:

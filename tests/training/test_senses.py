@@ -22,7 +22,7 @@ from mvitac.training.loop import train
 from mvitac.transforms.random_views import Augment, ViewAugment
 from support.small_methods import small
 from support.toy import Toy
-from support.training_runs import assert_equal_weights, power_cut, smoke, weights
+from support.training_runs import smoke, train_twice, weights
 
 VISION = "test_resnet.r160_in1k"  # 96 features; its inputs are normalised by .5, not by ImageNet's mean and deviation
 TWO = Encoders(
@@ -48,12 +48,7 @@ def started(pack: Pack, file: Path, **vision: object) -> Run:
 
 def test_from_training_to_the_exported_model(pack: Pack, file: Path, tmp_path: Path) -> None:
     run = started(pack, file)
-    train(run, tmp_path / "straight", quiet=True)
-    with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
-        train(run, tmp_path / "cut", quiet=True)
-    train(run, tmp_path / "cut", resume=True, quiet=True)
-    assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
-    trained, start = weights(tmp_path / "cut"), build_trunk(run.encoder.vision, 3).state_dict()
+    trained, start = weights(train_twice(run, tmp_path, cut=3)), build_trunk(run.encoder.vision, 3).state_dict()
     assert not any(torch.equal(trained[f"encoders.vision.{name}"], value) for name, value in start.items())
 
     model = mvitac.load(tmp_path / "cut")
@@ -119,16 +114,12 @@ def test_a_locked_trunk_sees_each_whole_image_once(
     seen: list[str] = []
     real = features.pack_features
     monkeypatch.setattr(features, "pack_features", lambda *given, **how: seen.append(given[2]) or real(*given, **how))
-    train(run, tmp_path / "straight", quiet=True)
-    mvitac.probe(tmp_path / "straight", tasks=("bright",), controls=False)
+    once = train_twice(run, tmp_path, cut=3)
+    mvitac.probe(once, tasks=("bright",), controls=False)
     assert seen.count("vision") == 1
-    with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
-        train(run, tmp_path / "cut", quiet=True, validate=False)
-    train(run, tmp_path / "cut", resume=True, quiet=True, validate=False)
-    assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
     monkeypatch.setattr(setup, "is_locked", lambda trunk: False)
     train(run, tmp_path / "seen", quiet=True, validate=False)
-    first, second = weights(tmp_path / "straight"), weights(tmp_path / "seen")
+    first, second = weights(once), weights(tmp_path / "seen")
     for parameter, value in first.items():
         torch.testing.assert_close(value, second[parameter], rtol=1e-3, atol=1e-4, msg=parameter)
 
