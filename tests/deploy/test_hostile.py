@@ -177,7 +177,7 @@ class Payload:
         return sys.exit, ("unpickled",)
 
 
-MODEL, PROBES = "model.safetensors", "probes.safetensors"
+MODEL = "model.safetensors"
 WEIGHT, BIAS = "pattern.touch.weight", "pattern.touch.bias"
 NO_SPREAD = {"name": "n", "unit": "N", "edges": [], "spread": []}
 LARGE = 10**9  # every image would be resized to it

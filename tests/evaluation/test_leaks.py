@@ -291,13 +291,6 @@ def test_other_names_of_the_data_count_too(pack: Pack, tmp_path: Path) -> None:
     assert scored.leak([source], rows, ["TAG", "touch-and-go"]).startswith("touch-and-go was in its owner's training")
 
 
-@pytest.mark.parametrize(
-    ("tag", "expected"),
-    [
-        ("augreg_in21k_ft_in1k", "timm's augreg_in21k_ft_in1k"),
-        ("mystery", UNKNOWN),
-        ("", UNKNOWN),
-    ],
-)
-def test_what_timm_says_of_its_weights(tag: str, expected: str) -> None:
-    assert said(tag) == expected
+def test_what_timm_says_of_its_weights() -> None:
+    tags = ("augreg_in21k_ft_in1k", "mystery", "")
+    assert [said(tag) for tag in tags] == ["timm's augreg_in21k_ft_in1k", UNKNOWN, UNKNOWN]

@@ -176,26 +176,16 @@ def test_weights_that_do_not_fit_are_refused(kind: str, state: State, tmp_path: 
     assert len(str(caught.value).splitlines()) == 1 and str(tmp_path / "w.pth") in str(caught.value)
 
 
-def from_init(file: Path, pack: Pack) -> None:
-    run = recipe("smoke", PackConfig(path=pack.path))
-    run = replace(run, encoder=run.encoder.changed(trunk=NAME))
-    start = read_start(Init(path=file))
-    load_start(start, run.method.build(pack.spec, run.encoder))  # type: ignore[arg-type]
-
-
-ROUTES: dict[str, Callable[[Path, Pack, Path], Any]] = {
-    "external timm": lambda file, pack, run: open_model(f"external:timm/{NAME},weights={file}"),
-    "--init": lambda file, pack, run: from_init(file, pack),
-}
-
-
-@pytest.mark.parametrize("route", ROUTES)
-def test_every_way_to_weights_is_strict(route: str, state: State, pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
-    import safetensors.torch
-
-    safetensors.torch.save_file(without("layer4.", state), tmp_path / "w.safetensors")
-    with pytest.raises(ValueError, match=r"w\.safetensors does not fit .* missing"):
-        ROUTES[route](tmp_path / "w.safetensors", pack, smoke_run)
+def test_every_way_to_weights_is_strict(state: State, pack: Pack, tmp_path: Path) -> None:
+    file, run = tmp_path / "w.safetensors", recipe("smoke", PackConfig(path=pack.path))
+    safetensors.torch.save_file(without("layer4.", state), file)
+    method = run.method.build(pack.spec, run.encoder.changed(trunk=NAME))
+    for route in (
+        lambda: open_model(f"external:timm/{NAME},weights={file}"),
+        lambda: load_start(read_start(Init(path=file)), method),  # type: ignore[arg-type]
+    ):
+        with pytest.raises(ValueError, match=r"w\.safetensors does not fit .* missing"):
+            route()
 
 
 def test_positions_of_another_size_are_those_that_timm_makes(tmp_path: Path) -> None:

@@ -37,17 +37,12 @@ from support.toy import toy_pack
 from support.training_runs import assert_equal_weights, batches, power_cut, smoke, stopped_at_four, views_by
 
 
-@pytest.fixture(scope="module")
-def straight(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train(smoke(pack), tmp_path_factory.mktemp("run") / "straight", quiet=True)
-
-
-def test_leaves_the_promised_files(straight: Path) -> None:
-    assert {p.name for p in straight.iterdir()} == {
+def test_leaves_the_promised_files(smoke_run: Path) -> None:
+    assert {p.name for p in smoke_run.iterdir() if not p.name.startswith("probe")} == {
         *("run.json", "trained_on.safetensors", "log.jsonl", "checkpoint.pt", "model.safetensors"),
         "model.best.safetensors",
     }
-    lines = [json.loads(line) for line in (straight / "log.jsonl").read_text().splitlines()]
+    lines = [json.loads(line) for line in (smoke_run / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines if "loss" in line] == [2, 4, 6, 8]
     assert [line["step"] for line in lines if "eval" in line] == [0, 4, 8]
     for line in lines:
@@ -56,13 +51,13 @@ def test_leaves_the_promised_files(straight: Path) -> None:
 
 
 @pytest.mark.parametrize("stop_after", [3, 7])
-def test_stopped_and_resumed_equals_straight(pack: Pack, straight: Path, tmp_path: Path, stop_after: int) -> None:
+def test_stopped_and_resumed_equals_straight(pack: Pack, smoke_run: Path, tmp_path: Path, stop_after: int) -> None:
     """Also across a change of epoch, with dropout, and with a checkpoint older than the stop."""
     run = smoke(pack, checkpoint_every=2)
     with power_cut(stop_after), pytest.raises(RuntimeError, match="power cut"):
         train(run, tmp_path / "r", quiet=True)
     train(run, tmp_path / "r", resume=True, quiet=True)
-    assert_equal_weights(straight, tmp_path / "r")
+    assert_equal_weights(smoke_run, tmp_path / "r")
     steps = [json.loads(line)["step"] for line in (tmp_path / "r" / "log.jsonl").read_text().splitlines()]
     assert steps == sorted(steps) and steps.count(8) == 2  # one step line, one eval line, nothing twice
 
@@ -85,7 +80,7 @@ def flip(path: Path) -> None:
 
 
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(
-    pack: Pack, straight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    pack: Pack, smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One flipped bit among the weights. Once it is resumed and cut again, both are good ones."""
     out = tmp_path / "r"
@@ -98,28 +93,28 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(
     assert f"continuing from {out / PREVIOUS}, step 2" in said
     assert [torch.load(out / name, weights_only=True)["step"] for name in (PREVIOUS, CHECKPOINT)] == [2, 4]
     train(run, out, resume=True, quiet=True)
-    assert_equal_weights(straight, out)
+    assert_equal_weights(smoke_run, out)
     assert capsys.readouterr().err == "" and not (out / PREVIOUS).exists()
 
 
-def test_killed_between_two_checkpoints(pack: Pack, straight: Path, tmp_path: Path) -> None:
+def test_killed_between_two_checkpoints(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
     """The old one has moved away, the new one is not there yet."""
     run = cut_after_five(pack, tmp_path / "r")
     os.replace(tmp_path / "r" / CHECKPOINT, tmp_path / "r" / PREVIOUS)
     with power_cut(4):  # steps 5 to 8 and no more
         train(run, tmp_path / "r", resume=True, quiet=True)
-    assert_equal_weights(straight, tmp_path / "r")
+    assert_equal_weights(smoke_run, tmp_path / "r")
 
 
 @pytest.mark.parametrize("resume", [False, True])
-def test_killed_before_its_record_has_its_name(pack: Pack, straight: Path, tmp_path: Path, resume: bool) -> None:
+def test_killed_before_its_record_has_its_name(pack: Pack, smoke_run: Path, tmp_path: Path, resume: bool) -> None:
     """The folder then holds nothing but a temporary file; a foreign file in it is still refused."""
     (tmp_path / "r").mkdir()
     for name in ("run.json", "log.jsonl"):
         (left := tmp_path / "r" / f".{name}.{'a' * 32}.tmp").touch()
         os.utime(left, (0, 0))
     train(smoke(pack), tmp_path / "r", resume=resume, quiet=True)
-    assert_equal_weights(straight, tmp_path / "r")
+    assert_equal_weights(smoke_run, tmp_path / "r")
     assert not list((tmp_path / "r").glob(".*"))
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / ".thesis.tex.tmp").touch()
@@ -155,7 +150,7 @@ def command(pack: Pack, out: Path) -> list[str]:
 
 
 @pytest.mark.slow
-def test_sigkill_at_random_moments(pack: Pack, straight: Path, tmp_path: Path) -> None:
+def test_sigkill_at_random_moments(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
     """Killed with SIGKILL twice at random steps, then resumed: the weights of the run that was not."""
     out, rng = tmp_path / "killed", random.Random()
     killed = 0
@@ -171,17 +166,17 @@ def test_sigkill_at_random_moments(pack: Pack, straight: Path, tmp_path: Path) -
             time.sleep(0.002)
     finish(begin(main, command(pack, out)))
     assert killed == 2
-    assert_equal_weights(straight, out)
+    assert_equal_weights(smoke_run, out)
 
 
-def test_ctrl_c_saves_and_says_how_to_go_on(pack: Pack, straight: Path, tmp_path: Path) -> None:
+def test_ctrl_c_saves_and_says_how_to_go_on(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
     """In a process of its own: libraries of other tests may leave one in which no signal can be handled."""
     process = begin(stopped_at_four, pack.path, tmp_path / "r", output=tmp_path / "said")
     finish(process, tmp_path / "said")
     assert f"after step 4 of 8; {tmp_path / 'r'} continues with resume" in (tmp_path / "said").read_text()
     assert torch.load(tmp_path / "r" / "checkpoint.pt", weights_only=True)["step"] == 4
     train(smoke(pack), tmp_path / "r", resume=True, quiet=True)
-    assert_equal_weights(straight, tmp_path / "r")
+    assert_equal_weights(smoke_run, tmp_path / "r")
 
 
 def test_not_a_number_stops_and_keeps_the_last_good_checkpoint(pack: Pack, tmp_path: Path) -> None:
@@ -196,11 +191,11 @@ def test_not_a_number_stops_and_keeps_the_last_good_checkpoint(pack: Pack, tmp_p
     assert not list(tmp_path.glob("*/model.safetensors"))
 
 
-def test_resume_refuses_a_different_run(pack: Pack, straight: Path) -> None:
+def test_resume_refuses_a_different_run(pack: Pack, smoke_run: Path) -> None:
     with pytest.raises(ValueError, match="already holds a run"):
-        train(smoke(pack), straight, quiet=True)
+        train(smoke(pack), smoke_run, quiet=True)
     with pytest.raises(ValueError, match="holds a different run"):
-        train(smoke(pack, seed=3), straight, resume=True, quiet=True)
+        train(smoke(pack, seed=3), smoke_run, resume=True, quiet=True)
 
 
 def test_learns_the_stripes(tmp_path: Path) -> None:
@@ -219,7 +214,7 @@ def test_learns_the_stripes(tmp_path: Path) -> None:
         assert lines[-2][part] < 0.9 * lines[1][part], part
 
 
-def test_evaluation_never_reads_test_rows(pack: Pack, straight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evaluation_never_reads_test_rows(pack: Pack, smoke_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import mvitac
     from mvitac.training import validation as module
 
@@ -228,7 +223,7 @@ def test_evaluation_never_reads_test_rows(pack: Pack, straight: Path, monkeypatc
     monkeypatch.setattr(
         module, "pack_features", lambda m, p, mod, rows, **k: used.append(rows) or real(m, p, mod, rows, **k)
     )
-    validate(mvitac.load(straight), pack, smoke(pack))
+    validate(mvitac.load(smoke_run), pack, smoke(pack))
     assert used and not set(np.concatenate(used)) & set(pack.rows("test"))
 
 

@@ -25,9 +25,6 @@ def images(num: int = 8, channels: int = 3, side: int = 40) -> torch.Tensor:
     return (F.interpolate(noise, (side, side), mode="bicubic").clamp(0, 1) * 255).to(torch.uint8)
 
 
-ROUTES = (random_views._one_by_one, random_views._batched)
-
-
 def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
