@@ -118,8 +118,10 @@ def _head(study: Study, title: str) -> Markup:
         "input": ", ".join(dict.fromkeys(f"{r.run.augment.whole_of(m)} px" for r in runs for m in modalities)),
     }
     summary = study.result["summary"]
-    said = verdicts(next(iter(summary.values()))) if summary else ["Nothing is scored on this data"]
-    text = "".join(f"{line}. " for line in said).rstrip()
+    text = "Nothing is scored on this data."
+    if summary:
+        task, first = next(iter(summary.items()))
+        text = f"On {task}, {'. '.join(said)}." if (said := verdicts(first)) else ""
     tiles = [_tile(study, task) for task in summary]
     return page.head(title, "Pre-training report", chips, text, tiles)
 
