@@ -45,7 +45,6 @@ READING = {
     "data info": "data info {base}/pack",
     "data check": "data check {base}/pack",
     "data check --data": "data check --data folder --path {base}/table --workers 1",
-    "data show": "data show {base}/pack --out {out}/show.png",
     "live": "live {base}/export --vision {base}/table@99 --touch {base}/table@99 --seconds 1",
     "find": "find {base}/table/touch0.png --model {base}/run --known {base}/e.parquet --from touch --to touch",
     "pretrain mix": "pretrain --recipe smoke --data mix --data.parts a={base}/pack:1 b={base}/pack:2 --augment.size 16"

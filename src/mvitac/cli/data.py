@@ -17,7 +17,7 @@ from mvitac.data.pack_table import SPLITS
 from mvitac.data.spec import Task, Window, listed
 from mvitac.datasets.base import DatasetConfig, dataset
 from mvitac.datasets.mix import open_packs
-from mvitac.system.files import check_place, write_atomic
+from mvitac.system.files import check_place
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,35 +154,3 @@ def _majority(pack: Pack, task: Task, split: str) -> dict[str, Any] | None:
         return None
     common = int(np.bincount(labels).argmax())
     return {"class": task.classes[common], "share": float((labels == common).mean())}
-
-
-@dataclass(frozen=True)
-class _ShowOptions:
-    """A few pairs of every class or object, to check by eye."""
-
-    pack: Positional[tuple[str, ...]]
-    """Folder of the pack. Several, each FOLDER or NAME=FOLDER, are taken as one (--data mix)."""
-    by: str = ""
-    """Task or table column, one strip per value (default: the first task, else the group)."""
-    split: str = ""
-    """Show rows of train, val, test or unlabelled only."""
-    num: int = 6
-    """Pairs per strip, of different groups if there are enough."""
-    seed: int = 0
-    """Seed of the draw."""
-    out: Path | None = None
-    """The picture (default: NAME-OF-THE-PACK.png here)."""
-
-
-def show(argv: list[str]) -> None:
-    """mvitac data show PACK [PACK ...] [--by TASK|COLUMN] [--out FILE.png]"""
-    options = parse(_ShowOptions, argv, "data show")
-    out = options.out or Path(f"{'-'.join(Path(one).resolve().name for one in options.pack) or 'pack'}.png")
-    from mvitac.report import contact_sheet
-
-    check_place(out)
-    pack = open_packs(options.pack)
-    found, num_all = contact_sheet.strips(pack, options.by, split=options.split, num=options.num, seed=options.seed)
-    picture = contact_sheet.to_image(pack, found, num_all)
-    write_atomic(out, lambda file: picture.save(file, "PNG"))
-    print(f"{out}: {len(found)} of {num_all} strips")

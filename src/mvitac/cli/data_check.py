@@ -17,7 +17,7 @@ from mvitac.datasets.base import DatasetConfig, dataset
 from mvitac.datasets.mix import open_packs
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.table.table import RowsConfig
-from mvitac.report.contact_sheet import draw, suspicious
+from mvitac.report.contact_sheet import draw, samples, suspicious
 from mvitac.system.files import check_place, write_atomic
 
 _MANUAL = """Examine a dataset: unreadable, constant, swapped, mislabelled, copied, leaking, out of step, outside train.
@@ -32,7 +32,7 @@ class _Options:
     json: Path | None = None
     """Also write every finding to this file; - = stdout, and the table to stderr."""
     sheet: Path | None = None
-    """Also draw the suspicious rows into this PNG, or a sample if there are none."""
+    """Also draw the suspicious rows into this PNG, and a few pairs of every class or group, to check by eye."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +82,8 @@ def _sheet(what: str, options: _Options) -> Draw | None:
     check_place(out)
 
     def sheet(pack: Pack, findings: Sequence[Finding]) -> None:
-        write_atomic(out, lambda file: draw(what, suspicious(pack, findings)).save(file, format="PNG"))
+        blocks = [*suspicious(pack, findings), *samples(pack)]
+        write_atomic(out, lambda file: draw(what, blocks).save(file, format="PNG"))
         print(f"written: {out}", file=printed_to(options.json))
 
     return sheet

@@ -22,7 +22,6 @@ COMMANDS = {
     "data pack": "data:pack",
     "data info": "data:info",
     "data check": "data_check:check",
-    "data show": "data:show",
     "pretrain": "pretrain:pretrain",
     "finetune": "finetune:finetune",
     "probe": "evaluate:probe",

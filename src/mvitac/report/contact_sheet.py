@@ -1,4 +1,4 @@
-"""A contact sheet of a pack: a few pairs of each class or object, or the suspicious rows, to check the data by eye.
+"""A contact sheet of a pack, to check the data by eye: the suspicious rows, and a few pairs of each class or object.
 
 Check that camera and touch belong together, labels are right, colours look natural, and nothing is blank or upside down.
 """
@@ -12,80 +12,53 @@ from PIL import Image, ImageDraw, ImageFont
 from mvitac.data.checks.finding import Finding
 from mvitac.data.images import fit, side_by_side
 from mvitac.data.pack import Pack
-from mvitac.data.pack_table import SPLITS
-from mvitac.registry import unknown
 
 Tile = tuple[np.ndarray, str]  # a picture, uint8 [H, W, 3], and the text below it
 Block = tuple[str, Sequence[Tile]]  # pictures under one heading
-SIDE, NUM_SHOWN, NUM_SAMPLE = 96, 8, 24  # pixels; rows shown of a finding; rows shown if nothing is suspicious
-LIMIT = 40  # strips of a sheet
+SIDE, NUM_SHOWN, NUM_SAMPLE = 96, 8, 6  # pixels; rows shown of a finding; rows of a class
+LIMIT = 40  # classes of a sheet
 GAP = 8  # pixels between pictures
 MISSING, CROSS = 225, 150  # gray levels of the tile that stands for a missing image
 
 
-def strips(
-    pack: Pack, by: str = "", *, split: str = "", num: int = 6, seed: int = 0
-) -> tuple[list[tuple[str, np.ndarray]], int]:
-    """Choose random rows of each value of the task or column ``by`` (default: the first task, else the group).
+def suspicious(pack: Pack, findings: Sequence[Finding]) -> list[Block]:
+    """Return a block per finding of ``data check`` that lists rows."""
+    wrong = [f for f in findings if f.rows and f.verdict in ("look", "broken")]
+    order = f"each pair: {contents(pack)}"
+    return [(f"{f.verdict}: {f.item}. {f.evidence} ({order})", _tiles(pack, f.rows[:NUM_SHOWN])) for f in wrong]
 
-    Of its ``num`` rows, those of different groups (within one group: touches) come first. Returns at most ``LIMIT``
-    strips, each a heading such as ``wood: 48 rows, 12 objects`` and its rows, and their number without it.
+
+def samples(pack: Pack) -> list[Block]:
+    """Return a block of random rows for each class of the first task, or for each group of a pack without labels.
+
+    Rows of different groups (within one group: touches) come first. Of more than ``LIMIT`` classes, the first are shown.
     """
-    names = [task.name for task in pack.spec.tasks]
-    by = by or (names[0] if names else "group")
-    if by in names:
-        task = pack.spec.tasks[names.index(by)]
-        words = np.array([*task.classes, "(no label)"])[pack.column(f"label_{by}")]
+    words, order = pack.column("group").astype(str), sorted(set(pack.column("group").astype(str)))
+    if pack.spec.tasks:
+        task = pack.spec.tasks[0]
         order = [*task.classes, "(no label)"]
-    elif by in pack.table.column_names:
-        words = pack.column(by).astype(str)
-        order = sorted(set(words))
-    else:
-        raise unknown("task or column", by, [*names, *pack.table.column_names])
-    allowed = np.isin(pack.column("split"), (split,) if split else SPLITS)
+        words = np.array(order)[pack.column(f"label_{task.name}")]
     groups = np.unique(pack.column("group").astype(str), return_inverse=True)[1]
-    rng = np.random.default_rng(seed)
-    found = []
+    rng, found = np.random.default_rng(0), []
     for name in order:
-        rows = np.flatnonzero((words == name) & allowed)
-        if len(rows):
-            several = len(set(groups[rows]))
-            apart = groups[rows] if several > 1 else pack.touch_groups[rows]
-            of = f", {several} {pack.spec.group_by}s" * (several > 1)
-            heading = f"{name}: {len(rows)} row{'s' * (len(rows) > 1)}{of}"
-            found.append((heading, _spread(rows, apart, num, rng)))
-    if not found:
-        raise ValueError(f"{pack.path} has no rows in split {split}: choose another")
-    return found[:LIMIT], len(found)
+        if len(rows := np.flatnonzero(words == name)):
+            num = len(set(groups[rows]))
+            of = f", {num} {pack.spec.group_by}s" * (num > 1)
+            chosen = _spread(rows, groups[rows] if num > 1 else pack.touch_groups[rows], rng)
+            found.append((f"{name}: {len(rows)} row{'s' * (len(rows) > 1)}{of}", _tiles(pack, chosen)))
+    left_out = [(f"{len(found) - LIMIT} more are not shown", [])] * (len(found) > LIMIT)
+    return [*found[:LIMIT], *left_out]
 
 
-def _spread(rows: np.ndarray, groups: np.ndarray, num: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw ``num`` of ``rows``, one of every group before a second of any."""
+def _spread(rows: np.ndarray, groups: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw ``NUM_SAMPLE`` of ``rows``, one of every group before a second of any."""
     order = rng.permutation(len(rows))
     turns: dict[int, int] = {}
     keys = []
     for group in groups[order].tolist():
         keys.append(turns.get(group, 0))
         turns[group] = keys[-1] + 1
-    return rows[order[np.argsort(keys, kind="stable")][:num]]
-
-
-def to_image(pack: Pack, found: Sequence[tuple[str, np.ndarray]], num_all: int, *, side: int = 96) -> Image.Image:
-    """All strips in one image."""
-    left_out = f"; {num_all - len(found)} more not shown" * (num_all > len(found))
-    title = f"{pack.spec.name}, {pack.num} rows at {pack.size} px; each pair: {contents(pack)}{left_out}"
-    return draw(title, [(heading, [(pair(pack, int(row), side), "") for row in rows]) for heading, rows in found])
-
-
-def suspicious(pack: Pack, findings: Sequence[Finding]) -> list[Block]:
-    """Return a block per finding of ``data check`` that lists rows. Without any, one block of rows drawn at random."""
-    order = f"each pair: {contents(pack)}"
-    wrong = [f for f in findings if f.rows and f.verdict in ("look", "broken")]
-    if wrong:
-        return [(f"{f.verdict}: {f.item}. {f.evidence} ({order})", _tiles(pack, f.rows[:NUM_SHOWN])) for f in wrong]
-    num = min(NUM_SAMPLE, pack.num)
-    rows = np.sort(np.random.default_rng(0).choice(pack.num, num, replace=False))
-    return [(f"No suspicious rows. {num} of {pack.num} rows, drawn at random ({order})", _tiles(pack, rows))]
+    return rows[order[np.argsort(keys, kind="stable")][:NUM_SAMPLE]]
 
 
 def _tiles(pack: Pack, rows: Sequence[int] | np.ndarray) -> list[Tile]:

@@ -25,7 +25,6 @@ from mvitac.data.pack import Pack
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Task
 from mvitac.datasets.folder import FolderConfig
-from mvitac.report.contact_sheet import pair, suspicious
 
 NUM_OBJECTS, NUM_FRAMES, SIDE = 20, 16, 32
 TEST, VAL = (3, 8, 13, 18), (4, 9)
@@ -259,10 +258,11 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert found["verdict"] == "look" and found["rows"] == [3, 53, 103, 153, 203, 253, 303]
     with Image.open(tmp_path / "constant.png") as sheet:
         pixels = np.asarray(sheet)
-    assert (pixels == 7).all(2).sum() == 7 * 96 * 96  # the touch halves of the seven rows
+    constant = (pixels == 7).all(2).sum()  # the touch halves of the seven rows, and of those drawn for a class
+    assert constant >= 7 * 96 * 96 and constant % (96 * 96) == 0
     assert pixels.shape[1] <= 1280 and pixels.shape[0] > 2 * 96  # several rows of pairs
     with Image.open(tmp_path / "fine.png") as sheet:
-        assert sheet.height > 4 * 96  # a sample of 24 pairs
+        assert sheet.height > 2 * 96  # pairs of every class
 
 
 def test_the_command_on_a_source(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -348,15 +348,6 @@ def test_missing_images_are_no_faults_of_the_others(tmp_path: Path) -> None:
         assert wrong == ({"missing images"} if fault else set())
         assert f"{64 if fault else 107} of 320" in told["missing images"].evidence
     assert "no row of test has vision" in told["missing images"].evidence
-
-
-def test_without_suspicious_rows_the_sheet_is_a_sample(tmp_path: Path) -> None:
-    pack = build(Presses(), tmp_path / "p", size=SIDE, quiet=True)
-    ((heading, tiles),) = suspicious(pack, examine(pack))
-    assert heading.startswith("No suspicious rows. 24 of 320 rows, drawn at random (each pair: camera, touch)")
-    rows = [pack.column("id").tolist().index(caption.split()[0]) for _, caption in tiles]
-    assert len(set(rows)) == 24 and set(pack.column("split")[rows]) == {"train", "val", "test"}
-    assert all((image == pair(pack, row, 96)).all() for row, (image, _) in zip(rows, tiles, strict=True))
 
 
 def test_a_task_is_judged_by_its_own_split(tmp_path: Path) -> None:
