@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mvitac.data.pack import Pack
     from mvitac.deploy.artifact import load
-    from mvitac.deploy.scikit_learn import ImageFeatures
     from mvitac.evaluation.evaluate import probe
     from mvitac.model import Model
     from mvitac.nn.initial import Init
@@ -21,11 +20,10 @@ if TYPE_CHECKING:
     from mvitac.training.loop import train
 
 __version__ = "0.1.0"
-__all__ = ["ImageFeatures", "Init", "Model", "Pack", "Run", "load", "probe", "recipe", "train"]
+__all__ = ["Init", "Model", "Pack", "Run", "load", "probe", "recipe", "train"]
 
 _HOME = {"Model": "model", "Pack": "data.pack", "Run": "run", "recipe": "recipes", "train": "training.loop"}
-_HOME |= {"Init": "nn.initial", "probe": "evaluation.evaluate"}
-_HOME |= {"load": "deploy.artifact", "ImageFeatures": "deploy.scikit_learn"}
+_HOME |= {"Init": "nn.initial", "probe": "evaluation.evaluate", "load": "deploy.artifact"}
 
 
 def __getattr__(name: str) -> Any:

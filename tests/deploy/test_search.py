@@ -1,4 +1,4 @@
-"""Search is exact and finds pairs in both directions; the encoders as a scikit-learn transformer."""
+"""Search is exact and finds pairs in both directions."""
 
 import json
 from pathlib import Path
@@ -7,10 +7,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
-from sklearn.base import clone
 
 import mvitac
-from mvitac import ImageFeatures
 from mvitac.cli.main import main
 from mvitac.data.images import fit
 from mvitac.data.pack import Pack
@@ -107,31 +105,3 @@ def test_by_features_only_like_finds_like(artifact: Path, pack: Pack, tmp_path: 
         known.find(model, pack.images["touch"][row], "touch", "vision", 1)
     with pytest.raises(ValueError, match="num 0: give 1 or more"):
         known.find(model, pack.images["touch"][row], "touch", "touch", 0)
-
-
-NUM = 72
-
-
-@pytest.fixture(scope="module")
-def files(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Path]]:
-    folder = tmp_path_factory.mktemp("images")
-    paths = {m: [folder / f"{m}{i}.png" for i in range(NUM)] for m in ("vision", "touch")}
-    for modality, names in paths.items():
-        for row, name in enumerate(names):
-            Image.fromarray(pack.images[modality][row]).save(name)
-    return paths
-
-
-def test_features_are_the_models(smoke_run: Path, pack: Pack, files: dict[str, list[Path]]) -> None:
-    model = mvitac.load(smoke_run)
-    embedded = model.embed(vision=pack.images["vision"][:NUM], touch=pack.images["touch"][:NUM])
-    both = np.concatenate([embedded["vision"], embedded["touch"]], axis=1)
-    for modality, expected in [("touch", both[:, 64:]), ("vision", both[:, :64])]:
-        found = clone(ImageFeatures(model, modality)).fit_transform(files[modality])
-        np.testing.assert_array_equal(found, expected)
-    pairs = list(zip(files["vision"], files["touch"], strict=True))
-    frame = pytest.importorskip("pandas").DataFrame({"touch": files["touch"], "vision": files["vision"], "other": 0})
-    each = ImageFeatures(smoke_run, "both").fit(pairs)
-    assert len(each.get_feature_names_out()) == 128
-    for given in (pairs, frame, np.array(pairs).astype(str)):
-        np.testing.assert_array_equal(each.transform(given), both)

@@ -64,7 +64,6 @@ def examine(pack: Pack, *, part: bool = False, window: Window = SINGLE) -> list[
         table_checks.missing_images(pack),
         image_checks.constant_frames(pack, looks),
         image_checks.red_and_blue(pack, looks),
-        image_checks.swapped_modalities(pack, looks),
         image_checks.time_offset(pack, looks),
         *([value_checks.time_shift(pack, looks)] if pack.spec.values else []),
         *labels,

@@ -80,47 +80,6 @@ def _where(pack: Pack, rows: np.ndarray) -> str:
     return f", of {pack.spec.group_by} {listed(np.unique(pack.column('group')[rows].astype(str)).tolist(), 3)}"
 
 
-def swapped_modalities(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
-    """Find rows whose vision resembles the others' touch and whose touch resembles the others' vision."""
-    item = "vision and touch swapped"
-    if len(pack.spec.modalities) < 2:
-        return Finding(item, "not checkable", "one modality only")
-    pair = [next(one for one in looks.values() if one.modality == m) for m in ("vision", "touch")]
-    seen = np.flatnonzero(pair[0].seen & pair[1].seen)
-    if len(seen) < 16:
-        return Finding(item, "not checkable", "fewer than 16 usable pairs")
-    x = [np.concatenate([_coarse(one.thumbs[seen]), one.std[seen, None]], axis=1) for one in pair]
-    # A diagonal Gaussian per modality, by median and MAD, which a minority of swapped rows does not change.
-    middle = [np.median(values, axis=0) for values in x]
-    width = [1.4826 * np.median(np.abs(v - m), axis=0) + 6 for v, m in zip(x, middle, strict=True)]
-    fit = [[_log_likelihood(values, middle[k], width[k]) for k in (0, 1)] for values in x]
-    as_touch, as_vision = fit[0][1] - fit[0][0], fit[1][0] - fit[1][1]  # > 0: resembles the other modality
-    right = float(np.concatenate([as_touch < 0, as_vision < 0]).mean())
-    if right < 0.75:
-        evidence = f"cameras and gels look too similar here ({100 * right:.0f} % of the images can be told apart)"
-        return Finding(item, "not checkable", evidence)
-    bad = seen[(as_touch > 0) & (as_vision > 0)]
-    # Both images of a row resemble the other modality: always if swapped, sometimes by chance.
-    chance = float((as_touch > 0).mean() * (as_vision > 0).mean() * len(seen))
-    look = len(bad) > 2 * chance + 3 * chance**0.5
-    where = _where(pack, bad) * look
-    evidence = f"{share(len(bad), len(seen))} look swapped, {chance:.1f} by chance{where}; a swap of all is not seen"
-    advice = "look at the sheet (vision left, touch right); exchange the two paths or keys of these rows"
-    return judged(item, evidence, advice, bad.tolist(), look=look)
-
-
-def _log_likelihood(values: np.ndarray, middle: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """Return [N], the mean log-likelihood per feature of ``values`` [N, D], with outliers limited to 5 widths."""
-    z = np.clip((values - middle) / width, -5, 5)
-    return -0.5 * (z**2).mean(1) - np.log(width).mean()
-
-
-def _coarse(thumbs: np.ndarray) -> np.ndarray:
-    step = thumbs.shape[1] // 4
-    cut = thumbs[:, : 4 * step, : 4 * step].astype(np.float32)
-    return cut.reshape(len(cut), 4, step, 4, step, 3).mean(axis=(2, 4)).reshape(len(cut), -1)
-
-
 def time_offset(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     """Find a lag between motion in vision and in touch, by cross-correlation within ordered groups."""
     item = "time offset between streams"
