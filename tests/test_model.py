@@ -231,7 +231,7 @@ def test_background_is_subtracted_before_resizing(model: Model, monkeypatch: pyt
     assert not torch.equal(of_one[1], expected[1])
     found = model(touch=model.transform("touch", background=free[0])(press[1])[None])["touch"]
     torch.testing.assert_close(found, of_one[1:])
-    with pytest.raises(ValueError, match="there is no touch"):
+    with pytest.raises(ValueError, match="background cannot be used"):
         model.embed(vision=press, background=free)
 
 

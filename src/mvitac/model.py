@@ -255,17 +255,11 @@ class Model(nn.Module):
         return found
 
     def _check_background(self, modality: str, background: ImageInput | None) -> None:
-        if background is None:
-            return
-        first, why = self.spec.window.minus_first and "touch" in self.spec.window.of, ""
-        if modality != "touch":
-            why = "there is no touch"
-        elif first and self.spec.difference:
-            why = "this model's touch is minus a background, then minus its first frame"
-        elif not (self.spec.difference or first):
-            why = "this model was not trained on difference images of touch"
-        if why:
-            raise ValueError(f"background cannot be used, {why}: leave it out")
+        first = self.spec.window.minus_first and "touch" in self.spec.window.of
+        if background is not None and (modality != "touch" or self.spec.difference == first):
+            raise ValueError(
+                "background cannot be used: only touch minus a background, or minus its first frame, has one"
+            )
 
     def predict(
         self, *, vision: ImageInput | None = None, touch: ImageInput | None = None, background: ImageInput | None = None
@@ -286,8 +280,6 @@ class Model(nn.Module):
         """
         given = self.embed(vision=vision, touch=touch, background=background)
         asked = "both" if len(given) == 2 else next(iter(given))
-        if len({*map(len, given.values())}) > 1:
-            raise ValueError(f"predict: got {len(given['vision'])} vision and {len(given['touch'])} touch images")
         chosen = [r for r in self.probes.values() if r.info.modality == asked]
         if not chosen:
             raise ValueError(f"this model has no probe on {asked}: load an artifact written by `mvitac publish`")

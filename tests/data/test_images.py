@@ -79,7 +79,7 @@ def test_a_huge_image_is_refused_before_it_is_decoded(tmp_path: Path, side: int)
 
     head = side.to_bytes(4) + side.to_bytes(4) + bytes([8, 2, 0, 0, 0])
     (tmp_path / "x.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(b"")))
-    with pytest.raises(ValueError, match=r"x\.png (cannot be read as an image \(it has 9000|is too large)"):
+    with pytest.raises(ValueError, match=r"x\.png cannot be read as an image \((it has 9000|Image size)"):
         decode(tmp_path / "x.png")
 
 

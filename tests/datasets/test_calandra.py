@@ -229,16 +229,6 @@ def test_the_owners_order_is_python_2s_shuffle() -> None:
     assert sorted(expected) == names != expected
 
 
-def test_leave_one_object_out(folder: Path) -> None:
-    names = sorted(OBJECTS)
-    for k, name in enumerate(names):
-        splits = splits_of(CalandraConfig(path=folder, split=f"fold:{k}"))
-        assert [n for n, s in splits.items() if s == "test"] == [name]
-        assert splits == splits_of(CalandraConfig(path=folder, split=f"fold:{name}"))
-    with pytest.raises(ValueError, match="give 0 to 6"):
-        CalandraConfig(path=folder, split="fold:7").source()
-
-
 # -- 'after' ----------------------------------------------------------------------------------------------------------
 
 

@@ -387,7 +387,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "animation": (damage_frames, "2 frames"),
     "float": (lambda path: Image.fromarray(np.ones((8, 8), np.float32)).save(path, "TIFF"), "floating-point"),
     "32 bit": (lambda path: Image.fromarray(np.full((8, 8), 70000, np.int32)).save(path, "TIFF"), "not 0 to 65535"),
-    "gone": (lambda path: path.unlink(), "does not exist"),
+    "gone": (lambda path: path.unlink(), "No such file"),
 }
 
 
@@ -497,7 +497,7 @@ BAD: dict[str, tuple[Change | None, dict[str, Any], str]] = {
     "validation": (
         one(13, side="validation"),
         {"split": "side"},
-        r"row 13: unknown split in column 'side' 'validation': choose from train, val, test, unlabelled",
+        r"unknown split in column 'side' 'validation': choose from train, val, test, unlabelled",
     ),
     "leak of a group": (
         one(1, side="test"),

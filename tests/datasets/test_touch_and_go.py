@@ -371,7 +371,7 @@ def test_jpegs_that_are_missing_or_cut_are_listed(tmp_path: Path) -> None:
     (folder / "0000000025.jpg").write_bytes((folder / "0000000025.jpg").read_bytes()[:300])
     pack = packed(root, tmp_path / "pack", max_damaged=0.05)
     assert [name for name, _ in pack.meta["damaged"]] == [f"{NAMES[0]}/0000000021", f"{NAMES[0]}/0000000025"]
-    assert "does not exist" in pack.meta["damaged"][0][1] and "cannot be read" in pack.meta["damaged"][1][1]
+    assert "No such file" in pack.meta["damaged"][0][1] and "cannot be read" in pack.meta["damaged"][1][1]
 
 
 @pytest.mark.parametrize(

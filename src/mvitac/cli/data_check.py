@@ -38,8 +38,7 @@ class _Options:
 @dataclass(frozen=True, kw_only=True)
 class _PackOptions(_Options):
     pack: Positional[tuple[str, ...]]
-    """Folder of the pack, or of several (FOLDER or NAME=FOLDER) as one. Its windows of frames: --data pack --path FOLDER
-    --num-frames N. A source that is not packed yet: --data NAME ..."""
+    """Folder of the pack, or of several (FOLDER or NAME=FOLDER) as one. A source that is not packed yet: --data NAME ..."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,11 +65,10 @@ def check(argv: list[str]) -> int:
     draw_sheet = _sheet(name, options)
     data: Any = options.data
     if isinstance(data, PackConfig):
-        return _report(str(data.path), examine_pack(data.path, data.frame_window(), draw_sheet), options)
+        return _report(str(data.path), examine_pack(data.path, draw_sheet), options)
     # A leak is a finding here, beside all the others; packing refuses it.
     source = (replace(data, allow_leak=True) if isinstance(data, RowsConfig) else data).source()
-    asked: Any = {"num": options.items, "workers": data.workers, "quiet": options.quiet}
-    asked |= {"window": data.frame_window(), "draw": draw_sheet}
+    asked: Any = {"num": options.items, "workers": data.workers, "quiet": options.quiet, "draw": draw_sheet}
     return _report(name, examine_source(source, **asked), options)
 
 

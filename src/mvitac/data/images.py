@@ -57,17 +57,14 @@ def decode(path: str | Path | BinaryIO, name: str = "", span: Sequence[float] = 
                 return to_rgb(_jpeg(image))
             image.load()
             return to_rgb(image, span)
-    except FileNotFoundError:
-        raise ValueError(f"{name} does not exist: an image is missing there") from None
     except UnidentifiedImageError:
         raise ValueError(f"{name} cannot be read as an image (its content is none of {', '.join(FORMATS)})") from None
-    # PIL has no common base class for errors of damaged files.
-    except (OSError, ValueError, SyntaxError, TypeError, IndexError, EOFError, struct.error) as error:
+    except DAMAGED as error:
         raise ValueError(f"{name} cannot be read as an image ({' '.join(str(error).split())})") from None
-    except Image.DecompressionBombError as error:
-        raise ValueError(f"{name} is too large ({error})") from None
 
 
+DAMAGED = (OSError, ValueError, SyntaxError, TypeError, IndexError, struct.error, Image.DecompressionBombError)
+"""Errors of damaged files: PIL has no common base class for them."""
 DAMAGE = re.compile("Corrupt JPEG data|Premature end|Inconsistent progression")
 PADDING = re.compile(r" 1?\d extraneous bytes before marker 0xd9")
 """Of libjpeg's warnings: those of damage, and of the few bytes that USB cameras write before the end marker."""

@@ -89,12 +89,9 @@ class Pack:
         path = self._file("samples.parquet")
         try:
             table = pq.read_table(path)
-        except Exception as error:  # arrow raises several kinds for a damaged file
-            raise ValueError(f"{path} cannot be read ({brief(error)}): the pack is damaged, make it again") from None
-        try:
             check_table(table, self.spec)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error} (make the pack again)") from None
+        except Exception as error:  # arrow raises several kinds for a damaged file
+            raise ValueError(f"{path} cannot be used ({brief(error)}): make the pack again") from None
         return table
 
     def __repr__(self) -> str:
@@ -281,9 +278,8 @@ class Pack:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # about damaged headers
                 images = np.load(path, mmap_mode="r", allow_pickle=False)
+            if images.shape != expected or images.dtype != np.uint8:
+                raise ValueError(f"it holds {images.dtype} {images.shape}, pack.json promises uint8 {expected}")
+            return images
         except Exception as error:  # numpy raises many kinds for a damaged header
             raise ValueError(f"{path} cannot be mapped ({brief(error)}): the pack is damaged, make it again") from None
-        if not isinstance(images, np.ndarray) or images.shape != expected or images.dtype != np.uint8:
-            held = f"{images.dtype} {images.shape}" if isinstance(images, np.ndarray) else "no array"
-            raise ValueError(f"{path} holds {held}, pack.json promises uint8 {expected}")
-        return images

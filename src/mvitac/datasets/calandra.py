@@ -98,7 +98,7 @@ class CalandraConfig(DatasetConfig):
     """Folder with some or all of the shards calandra_corl2017_000.h5 to _037.h5."""
     split: str = "authors"
     """authors: the 32 training and 8 test objects of the paper's authors. object: the owners' split, 75 % of all objects
-    in train and 25 % in test, by split_seed. fold:K (K from 0, sorted by name) or fold:NAME: leave this object out."""
+    in train and 25 % in test, by split_seed."""
     split_seed: int = 0
     """Random seed for the splits of objects (object) and for the choice of val."""
     val_share: float = 0.15
@@ -111,8 +111,8 @@ class CalandraConfig(DatasetConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.split.startswith("fold:") and self.split not in ("authors", "object"):
-            raise unknown("split", self.split, ("authors", "object", "fold:K", "fold:NAME"))
+        if self.split not in ("authors", "object"):
+            raise unknown("split", self.split, ("authors", "object"))
         check_range(self, 0, 0.9, "val_share")
         check_range(self, 0, math.inf, "split_seed")
         for asked in self.ask:
@@ -262,17 +262,10 @@ def split_objects(config: CalandraConfig, names: Sequence[str]) -> dict[str, str
     if config.split == "authors":
         splits = {name: "train" for name in names if name in AUTHORS_TRAIN}
         splits |= {name: "test" for name in names if name in AUTHORS_TEST}
-    elif config.split == "object":
+    else:
         shuffled = owners_shuffle(names, config.split_seed)
         num_train = int(0.75 * len(shuffled))
         splits = {name: "train" if i < num_train else "test" for i, name in enumerate(shuffled)}
-    else:
-        out = config.split.removeprefix("fold:")
-        if out.isdigit() and out not in names and int(out) < len(names):
-            out = names[int(out)]
-        if out not in names:
-            raise unknown(f"object in split {config.split!r} (or give 0 to {len(names) - 1})", out, names)
-        splits = {name: "test" if name == out else "train" for name in names}
     if not splits:
         raise ValueError(f"{config.path} holds none of the authors' 40 objects: use split object, or more shards")
     train = sorted(name for name, split in splits.items() if split == "train")

@@ -1,4 +1,4 @@
-"""The doctor on values and windows: a healthy recording is called healthy, and each fault by its name and nothing else."""
+"""The doctor on values: a healthy recording is called healthy, and each fault by its name and nothing else."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.checks import value_checks
 from mvitac.data.checks.examine import examine
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample, Source
-from mvitac.data.spec import DataSpec, Target, ValueTask, Window
+from mvitac.data.spec import DataSpec, Target, ValueTask
 
 NUM, LENGTH = 16, 40
 TEST = (3, 7, 11, 15)
@@ -52,8 +51,6 @@ class Recordings(Source):
         rng = np.random.default_rng([11, item])
         force = 0.2 + (2.5 + 0.1 * (k // 2 % 4)) * np.sin(np.pi * i / LENGTH) + 0.01 * rng.normal()
         tilt = 0.3 * np.sin(k + i / 5)
-        if fault == "group of another unit" and k == 5:
-            force *= 1000
         if fault == "outlier" and item == 100:
             force = 60.0
         if fault == "stuck" and k == 4 and 10 <= i < 24:
@@ -62,9 +59,7 @@ class Recordings(Source):
             force += 2
         if (fault == "missing" and i % 4 == 0) or (fault == "no test" and k in TEST):
             force = float("nan")
-        gap = 8 * (fault == "gap" and k == 4 and i > 20)
-        rate = 2 if fault == "two rates" and k == 9 else 1
-        columns = {"id": f"{k:02d}-{i:02d}", "group": str(k), "touch_group": str(k), "seq": rate * i + gap}
+        columns = {"id": f"{k:02d}-{i:02d}", "group": str(k), "touch_group": str(k), "seq": i}
         columns |= {"split": "test" if k in TEST else "train", "force_n": force, "tilt": tilt}
         image = rng.integers(0, 255, (16, 16, 3), np.uint8)
         return [Sample(vision=None, touch=image, columns=columns)]
@@ -79,18 +74,16 @@ def healthy(tmp_path_factory: pytest.TempPathFactory) -> Pack:
     return packed(tmp_path_factory.mktemp("healthy") / "pack")
 
 
-def test_healthy_values_and_windows(healthy: Pack) -> None:
-    found = {finding.item: finding for finding in examine(healthy, window=Window(frames=3))}
-    values = found["values of force"], found["values of pose"], found["windows of 3 frames, stride 1"]
+def test_healthy_values(healthy: Pack) -> None:
+    found = {finding.item: finding for finding in examine(healthy)}
+    values = found["values of force"], found["values of pose"]
     assert all(finding.verdict == "ok" for finding in values), values
     assert "640 rows, 0.1" in values[0].evidence and " N, median" in values[0].evidence
-    assert "608 of 640 (95.0 %) rows have all frames before them, by column seq" in values[2].evidence
 
 
 @pytest.mark.parametrize(
     ("fault", "item", "says", "rows"),
     [
-        ("group of another unit", "values of force", "values of 5 are about", []),
         ("outlier", "values of force", "1 outliers, e.g. 60 in row 100", [100]),
         ("stuck", "values of force", "1 constant stretches, the longest 14 frames of 2 from row 170", [170]),
         ("outside", "values of force", "test rows are outside train (0.1", []),
@@ -112,33 +105,6 @@ def test_missing_values(tmp_path: Path) -> None:
     assert force.verdict == "ok" and "160 of 640 (25.0 %) rows of train, val and test have none" in force.evidence
     (force, _) = value_checks.values(packed(tmp_path / "b", "no test"))
     assert force.verdict == "broken" and "no row of test has a value" in force.evidence
-
-
-@pytest.mark.parametrize(
-    ("fault", "verdict", "says"),
-    [
-        ("gap", "look", "1 gaps in 1 of 16 (6.2 %) touches"),
-        ("two rates", "broken", "stride 1 is shorter than the distance of frames in touch '9', 2"),
-    ],
-)
-def test_each_fault_of_windows_is_found(tmp_path: Path, fault: str, verdict: str, says: str) -> None:
-    pack = packed(tmp_path / "pack", fault)
-    finding = value_checks.windows(pack, Window(frames=3))
-    assert finding.verdict == verdict and says in finding.evidence, finding
-    if fault == "two rates":
-        finding = value_checks.windows(pack, Window(frames=3, stride=2))
-        assert finding.verdict == "look" and "1 apart in some touches and 2 in others" in finding.evidence
-    assert value_checks.windows(pack, Window(frames=3), part=True).verdict == "not checkable"
-
-
-def test_the_command_checks_windows_when_asked(
-    healthy: Pack, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
-    main(["data", "check", str(healthy.path)])
-    assert "windows of" not in capsys.readouterr().out
-    assert main(["data", "check", "--data", "pack", "--path", str(healthy.path), "--num-frames", "50"]) == 2
-    assert "longer than every touch" in capsys.readouterr().out
 
 
 def test_a_stretch_of_zeros_is_no_contact(healthy: Pack) -> None:

@@ -14,9 +14,8 @@ from mvitac.data.checks.finding import Finding, judged
 from mvitac.data.checks.image_stats import look_at
 from mvitac.data.pack import Pack
 from mvitac.data.source import Lost, Sample, Source
-from mvitac.data.spec import DataSpec, Window
+from mvitac.data.spec import DataSpec
 
-SINGLE = Window()
 Draw = Callable[[Pack, Sequence[Finding]], None]  # draws a contact sheet
 
 
@@ -47,11 +46,10 @@ class _Some(Source):
         return self.source.read(self._chosen[item])
 
 
-def examine(pack: Pack, *, part: bool = False, window: Window = SINGLE) -> list[Finding]:
+def examine(pack: Pack, *, part: bool = False) -> list[Finding]:
     """Run every check on ``pack``.
 
-    Of a ``part`` of a source, missing classes may be in the rest, so they are not "broken". A ``window`` of several
-    frames is checked, too.
+    Of a ``part`` of a source, missing classes may be in the rest, so they are not "broken".
     """
     looks = look_at(pack)
     labels = [*table_checks.labels(pack), *value_checks.values(pack)]
@@ -73,11 +71,10 @@ def examine(pack: Pack, *, part: bool = False, window: Window = SINGLE) -> list[
         duplicates.exact_copies(pack, looks),
         duplicates.near_copies(pack, looks),
         table_checks.give_aways(pack),
-        *([value_checks.windows(pack, window, part=part)] if window.active else []),
     ]
 
 
-def examine_pack(pack: str | Path | Pack, window: Window = SINGLE, draw: Draw | None = None) -> list[Finding]:
+def examine_pack(pack: str | Path | Pack, draw: Draw | None = None) -> list[Finding]:
     """Check a pack, or the one at this path."""
     if not isinstance(pack, Pack):
         path = Path(pack)
@@ -87,7 +84,7 @@ def examine_pack(pack: str | Path | Pack, window: Window = SINGLE, draw: Draw | 
             if not (path / "pack.json").is_file():
                 raise
             return [judged("pack", str(error), "make it again; training refuses it, too", broken=True)]
-    findings = [Finding("pack", "ok", f"{pack.num} rows, every digest matches"), *examine(pack, window=window)]
+    findings = [Finding("pack", "ok", f"{pack.num} rows, every digest matches"), *examine(pack)]
     if draw:
         draw(pack, findings)
     return findings
@@ -100,7 +97,6 @@ def examine_source(
     size: int = 64,
     workers: int = 1,
     quiet: bool = False,
-    window: Window = SINGLE,
     draw: Draw | None = None,
 ) -> list[Finding]:
     """Findings about ``source``, which is read into a temporary pack of ``size`` px, to ``draw`` while it is there.
@@ -112,7 +108,7 @@ def examine_source(
     with tempfile.TemporaryDirectory(prefix="mvitac-check-") as folder:
         pack = build(some, Path(folder) / "pack", size=size, workers=workers, max_damaged=1.0, quiet=quiet)
         partly = len(some.items()) < len(source.items())
-        findings = examine(pack, part=partly, window=window)
+        findings = examine(pack, part=partly)
         read = f"{len(some.items())} of {len(source.items())} items examined, kept at {size} px"
         findings.insert(0, Finding("source", "ok", f"{pack.spec.name}: {read}"))
         if draw:

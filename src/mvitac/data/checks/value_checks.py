@@ -1,13 +1,13 @@
-"""Checks of tasks with values (units, outliers, stuck sensors, test outside train), and of windows of frames."""
+"""Checks of tasks with values: outliers, stuck sensors, test outside train, a shift in time."""
 
 import numpy as np
 
 from mvitac.data.checks.finding import Finding, judged, share
 from mvitac.data.checks.image_stats import ImageStats
 from mvitac.data.pack import Pack
-from mvitac.data.spec import Target, ValueTask, Window, listed
+from mvitac.data.spec import Target, ValueTask, Window
 from mvitac.data.stamps import STAMPS, seconds
-from mvitac.data.windows import frames_of, places, recordings
+from mvitac.data.windows import places, recordings
 
 STUCK_FRAMES = 10  # shortest constant stretch that is reported
 BLOCK = 240  # rows of a long recording in which one shift is looked for, up to a third of them
@@ -40,7 +40,6 @@ def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, tou
     if missing := sum(map(len, sides.values())) - len(rows):
         evidence.append(f"{share(missing, missing + len(rows))} rows of train, val and test have none")
     checks = {
-        "check the unit": _unit(known, pack.column("group")[rows].astype(str)),
         "repair these cells, or leave them empty": _outliers(rows, known),
         "a stuck or saturated sensor: leave these cells empty": _stuck(found, touches),
         "expect larger errors there, or split so that train covers test": _outside(found, measured, target),
@@ -61,19 +60,6 @@ def _touches(pack: Pack) -> list[np.ndarray]:
         return [*recordings(pack, places(pack, Window())[1])]
     except ValueError:
         return []
-
-
-def _unit(known: np.ndarray, groups: np.ndarray) -> Note:
-    """One group has another scale."""
-    names, counts = np.unique(groups, return_counts=True)
-    names = names[counts >= 20]
-    sizes = np.array([np.median(abs(known[groups == name])) for name in names])
-    usual = np.median(sizes) if len(sizes) else 0
-    odd = (sizes > 300 * usual) | ((sizes > 0) & (sizes < usual / 300))
-    if len(names) < 4 or not usual or not odd.any():
-        return "", []
-    times = sizes[odd][0] / usual
-    return f"values of {listed(names[odd].tolist(), 3)} are about {times:.2g} times those of other groups", []
 
 
 def _outliers(rows: np.ndarray, known: np.ndarray) -> Note:
@@ -168,27 +154,3 @@ def _shift(change: np.ndarray, value: np.ndarray, rows: np.ndarray) -> tuple[np.
         still = both.sum() < 8 or min(np.ptp(a[both]), np.ptp(b[both])) < 1e-6
         curve.append(0.0 if still else np.corrcoef(a[both], b[both])[0, 1])
     return rows, np.array(curve)
-
-
-def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
-    """Return whether the recordings of ``pack`` have the frames that ``window`` asks for, without gaps and at one rate."""
-    item = f"windows of {window.frames} frames, stride {window.stride:g}"
-    if part:
-        return Finding(item, "not checkable", "a part of the items has gaps: examine all of them")
-    try:
-        name, place = places(pack, window)
-        _, whole, _ = frames_of(pack, window)
-    except ValueError as error:
-        return judged(item, str(error), "training refuses these windows, too", broken=True)
-    steps = [np.diff(place[rows]) for rows in recordings(pack, place) if len(rows) > 2]
-    rates = [np.median(step) for step in steps]
-    gaps = [int((step > 2.5 * rate).sum()) for step, rate in zip(steps, rates, strict=True)]
-    evidence = [f"{share(int(whole.sum()), pack.num)} rows have all frames before them, by column {name}"]
-    advice = []
-    if any(gaps):
-        evidence.append(f"{sum(gaps)} gaps in {share(sum(map(bool, gaps)), len(gaps))} touches")
-        advice.append("a window across a gap shows an older frame than asked: split the touches there")
-    if rates and max(rates) > 1.25 * min(rates):
-        evidence.append(f"frames are {min(rates):.3g} apart in some touches and {max(rates):.3g} in others")
-        advice.append("give the stride in seconds with --data.order, or it means another time in each")
-    return judged(item, "; ".join(evidence), "; ".join(advice), look=bool(advice))

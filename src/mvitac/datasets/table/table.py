@@ -286,9 +286,8 @@ class Rows(Source):
             found = splits.assign_splits(groups, labels, config.test_share, config.val_share, config.split_seed)
         else:
             found = table.filled(column, "split")
-            for number, split in zip(table.numbers, found, strict=True):
-                if split not in SPLITS:
-                    raise ValueError(f"{where} row {number}: {unknown(f'split in column {column!r}', split, SPLITS)}")
+            for split in {*found} - {*SPLITS}:
+                raise ValueError(f"{where}: {unknown(f'split in column {column!r}', split, SPLITS)}")
         if not config.allow_leak:
             for what, names in whole.items():
                 splits.check_leak(where, column, what, names, found)
