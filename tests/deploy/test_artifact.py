@@ -9,7 +9,6 @@ import pytest
 import torch
 
 import mvitac
-from mvitac.data.images import difference
 from mvitac.data.pack import Pack
 from mvitac.deploy.artifact import ARTIFACT, preprocessing
 from mvitac.deploy.card import card
@@ -66,15 +65,6 @@ def test_difference_images_are_told(smoke_run: Path, pack: Pack, tmp_path: Path)
     minus = copied(pack)
     minus.spec = replace(pack.spec, difference=True)
     assert fitting(found, minus) == ("vision", "touch")
-
-
-def test_predict_subtracts_the_background(copy: Path, pack: Pack) -> None:
-    model = mvitac.load(copy)
-    model.spec = replace(model.spec, difference=True)
-    press, free = pack.images["touch"][3], pack.images["touch"][4]
-    expected = model.predict(touch=difference(press, free))["pattern"]
-    assert torch.equal(model.predict(touch=press, background=free)["pattern"], expected)
-    assert not torch.equal(model.predict(touch=press)["pattern"], expected)
 
 
 def test_the_hub_offline_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -69,8 +69,10 @@ def test_each_frame_is_minus_the_first_one_of_its_touch(published: Path, model: 
     other.spec = replace(other.spec, window=replace(other.spec.window, minus_first=True))
     touch = measured.images["touch"]
     clip, first = np.stack([touch[0], touch[3]]), touch[6]
-    wanted = other.embed(touch=np.stack([difference(frame, first) for frame in clip]))["touch"]
-    torch.testing.assert_close(other.embed(touch=clip, background=first)["touch"], wanted)
+    for ask, name in ((other.embed, "touch"), (other.predict, "pattern")):
+        wanted = ask(touch=np.stack([difference(frame, first) for frame in clip]))[name]
+        torch.testing.assert_close(ask(touch=clip, background=first)[name], wanted)
+        assert not torch.allclose(ask(touch=clip)[name], wanted)
     other.spec = replace(other.spec, difference=True)
     with pytest.raises(ValueError, match="background cannot be used"):
         other.embed(touch=clip, background=first)
