@@ -111,7 +111,7 @@ def test_the_report_shows_values(scored: tuple[Path, Pack, dict[str, Any]], tmp_
         assert f"{target['mae']:.3g} {target['unit']}" in page
     assert cell_text(result["summary"]["light"], "untrained", "vision") in page
     drawn = {file.name for file in (tmp_path / "figures").iterdir()}
-    assert {"predicted-light--level.png", "predicted-both--weight.png", "error-both--weight.png"} <= drawn
+    assert {"predicted-light--level.png", "predicted-both--weight.png"} <= drawn
     assert ">R2 %, mean and 95 % interval" in drawn_texts and ">accuracy %, mean and 95 % interval" in drawn_texts
 
 

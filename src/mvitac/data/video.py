@@ -41,7 +41,6 @@ class Packets(NamedTuple):
     places: np.ndarray  # [P] int64 positions in the file
     keys: np.ndarray  # [K] int64 ascending numbers of the packets at which decoding can start
     before: np.ndarray  # [P + 1] int64 number of frames stored before each packet, and in total
-    shape: tuple[int, int]  # height and width of the frames according to the container
 
     @property
     def num(self) -> int:
@@ -56,11 +55,6 @@ class Packets(NamedTuple):
 def num_frames(path: str | Path) -> int:
     """Return the number of frames according to the container; ValueError or OSError if it is not a complete video."""
     return _packets(path).num
-
-
-def frame_shape(path: str | Path) -> tuple[int, int]:
-    """Return height and width of the frames; ValueError or OSError if it is not a complete video."""
-    return _packets(path).shape
 
 
 def frame_times(path: str | Path) -> np.ndarray:
@@ -231,7 +225,6 @@ def _packets(path: str | Path) -> Packets:
 def _read_packets(path: str, size: int, changed: int) -> Packets:
     """Read the packet table. Mp4 and complete AVI files store one; in other files, all packets are visited."""
     with _opened(path) as (container, stream):
-        shape = (stream.codec_context.height, stream.codec_context.width)
         avi, table = "avi" in container.format.name, getattr(stream, "index_entries", None)  # PyAV 15 has no table
         if table is not None and ("mp4" in container.format.name or (avi and len(table) == stream.frames)):
             found = [(e.timestamp, e.pos, e.is_keyframe, e.is_discard) for e in table if e.size]
@@ -248,4 +241,4 @@ def _read_packets(path: str, size: int, changed: int) -> Packets:
         raise ValueError(f"{path} is put together from pieces by an edit list: encode it again, ffmpeg -i IN OUT.mp4")
     if (np.diff(dts) <= 0).any() or not len(keys):
         raise ValueError(f"{path} has frames out of order or no key frame: it is damaged, or convert it to mp4")
-    return Packets(dts, places, keys, before, shape)
+    return Packets(dts, places, keys, before)

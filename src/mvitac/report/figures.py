@@ -115,10 +115,8 @@ class Line:
 
 
 @matplotlib.rc_context(STYLE)
-def curves(
-    title: str, lines: Sequence[Line], references: Mapping[str, float] | None = None, x: str = "step", y: str = ""
-) -> Figure:
-    """Curves over steps, or over ``x``; ``references`` are horizontal lines such as chance."""
+def curves(title: str, lines: Sequence[Line], references: Mapping[str, float] | None = None) -> Figure:
+    """Curves over steps; ``references`` are horizontal lines such as chance."""
     figure, axes = new_figure(title, 2.75)
     handles: dict[str, Any] = {}
     several = len({line.label for line in lines}) < len(lines)  # seeds: thinner lines
@@ -127,22 +125,19 @@ def curves(
         look: dict[str, Any] = {"color": COLOURS[line.hue], "marker": marker, "markersize": 3.2}
         (drawn,) = axes.plot(line.x, line.y, line.dash, linewidth=1.2 if several else 1.8, **look)
         handles.setdefault(line.label, drawn)
-        if x == "step" and line.x[0] == 0:  # the value before the first step
+        if line.x[0] == 0:  # the value before the first step
             look = {"color": COLOURS[line.hue], "linestyle": "--", "linewidth": 0.9, "alpha": 0.6}
             handles["start"] = axes.axhline(line.y[0], zorder=0.9, **look)
     for number, (name, value) in enumerate((references or {}).items()):
         look = {"color": COLOURS["soft"], "linestyle": DASHES[1 + number % 3], "linewidth": 1.1}
         handles[name] = axes.axhline(value, zorder=0.9, **look)
     axes.grid(axis="y")
-    axes.xaxis.set_major_locator(MaxNLocator(5, integer=x == "step"))
+    axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.ticklabel_format(axis="y", useOffset=False)
     axes.margins(y=0.12)
-    if x == "step":
-        axes.set_xlim(0, 1.04 * max(max(line.x) for line in lines))
-    else:
-        axes.set_ylim(bottom=0)
-    axes.set(xlabel=x, ylabel=y)
+    axes.set_xlim(0, 1.04 * max(max(line.x) for line in lines))
+    axes.set_xlabel("step")
     labels = [shorten(label, 30) for label in handles]
     figure.legend(list(handles.values()), labels, loc=BELOW, ncols=2 if max(map(len, labels)) > 18 else 3)
     return figure

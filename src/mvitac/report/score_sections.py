@@ -1,6 +1,5 @@
 """Sections of the report about scores: every probe next to its controls, and predicted values against true ones."""
 
-from collections.abc import Sequence
 from typing import Any
 
 from markupsafe import Markup
@@ -21,7 +20,7 @@ from mvitac.evaluation.score_text import (
 )
 from mvitac.evaluation.scores import by_cell, summarise_again
 from mvitac.report import figures, tables
-from mvitac.report.html import CONTROL_GREYS, MODALITY_HUES
+from mvitac.report.html import MODALITY_HUES
 from mvitac.report.html import blocks as html
 from mvitac.report.sections import Study
 
@@ -108,16 +107,15 @@ def _per_class(study: Study) -> list[Markup]:
 
 
 def values(study: Study) -> list[Markup]:
-    """Predicted against true values of the first method and the error by range beside the controls, for each target."""
+    """Predicted against true values of the first method, for each target."""
     records = study.result["records"]
     cells = by_cell(records, records[0]["probe"]) if records else {}
     drawn = []
     for task, found in study.result["summary"].items():
         if score_name(found) == "accuracy":
             continue
-        modality, own, controls = headline(found, study.sources[0], study.sources)
+        modality, own, _ = headline(found, study.sources[0], study.sources)
         mine = cells[task, modality, study.sources[0]]
-        beside = {s: cells.get((task, modality, s)) or cells[task, "none", s] for s in controls}
         for t, target in enumerate(own["targets"]):
             name = target["name"] if target["name"] == task else f"{task}: {target['name']}"
             hue, unit = MODALITY_HUES[modality], target["unit"]
@@ -126,24 +124,9 @@ def values(study: Study) -> list[Markup]:
             text = f"R2 {percent(target['mean'])} %, mean absolute error {error_text(target)}; {len(points)} test rows"
             text += f" of {len(mine)} seeds." if len(mine) > 1 else "."
             drawn.append(study.figure(f"predicted {name}", drawing, f"Predicted against true {name}. {text}", text))
-            hues = [hue, *(CONTROL_GREYS.get(s, "soft") for s in beside)]
-            looks = [(own_hue, figures.DASHES[i % len(figures.DASHES)]) for i, own_hue in enumerate(hues)]
-            found_by = {study.sources[0]: mine, **beside}.items()
-            lines = [figures.Line(s, *_errors(each, t), *look) for (s, each), look in zip(found_by, looks, strict=True)]
-            x, y = f"true, {unit}", f"mean absolute error, {unit}"
-            drawing = figures.curves(f"{name}: error by range", lines, x=x, y=y)
-            alt = f"Mean absolute error of {name} by range of the true value"
-            drawn.append(study.figure(f"error {name}", drawing, alt, "Ranges hold equally many test rows."))
     if not drawn:
         return []
     intro = (
         f"A point is a test row ({study.sources[0]}). A flat cloud means that the probe answers about the same for all."
     )
     return [html.paragraph(intro), html.grid(drawn)]
-
-
-def _errors(records: Sequence[dict[str, Any]], t: int) -> tuple[list[float], list[float]]:
-    """Middles of the ranges of the true value, and the error of target ``t`` there: mean over seeds, which share them."""
-    each = [*zip(*(record["targets"][t]["ranges"] for record in records), strict=True)]
-    middles = [(parts[0]["low"] + parts[0]["high"]) / 2 for parts in each]
-    return middles, [sum(part["mae"] for part in parts) / len(parts) for parts in each]

@@ -14,22 +14,20 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 
-def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, sync: bool = True) -> None:
+def write_atomic(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Let ``write`` fill a temporary file next to ``path``, then rename it, so that no reader sees a partial file.
 
-    Missing folders are created. After an error (full disk, Ctrl-C) ``path`` is unchanged. ``sync`` flushes to disk, which
-    protects against power loss, and removes temporary files that killed processes left.
+    Missing folders are created. After an error (full disk, Ctrl-C) ``path`` is unchanged. It is flushed to disk, against
+    power loss. Temporary files that killed processes left are removed.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    if sync:
-        _remove_orphans(path)
+    _remove_orphans(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         with naming(path), temporary.open("wb") as file:
             write(file)
             file.flush()
-            if sync:
-                os.fsync(file.fileno())
+            os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException as error:
         with contextlib.suppress(OSError):
