@@ -31,18 +31,11 @@ def engine(onnx: Path) -> Engine:
     return Engine(onnx, threads=1)
 
 
-class Slow:
-    """The engine, taking 4 ms of the fake clock."""
+class Other(Engine):
+    """An opened engine, some of whose attributes are changed."""
 
-    def __init__(self, engine: Engine) -> None:
-        self.engine, self.inputs, self.classes, self.meta = engine, engine.inputs, engine.classes, engine.meta
-        self.values, self.difference, self.window = engine.values, engine.difference, engine.window
-        self.clock: Clock | None = None
-
-    def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
-        assert self.clock
-        self.clock.now += 0.004
-        return self.engine(**images)
+    def __init__(self, engine: Engine, **changes: Any) -> None:
+        self.__dict__ = vars(engine) | changes
 
 
 def test_a_touch_is_found_answered_and_ended(engine: Engine) -> None:
@@ -63,14 +56,12 @@ def test_a_model_of_difference_images_sees_a_touch_minus_its_background(engine: 
     seen: list[np.ndarray] = []
     kept: list[np.ndarray] = []
 
-    class Minus(Slow):
+    class Seeing(Other):
         def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
             seen.append(images["touch"][0].astype(float))
-            return self.engine(**images)
+            return super().__call__(**images)
 
-    slow = Minus(engine)
-    slow.difference = True
-    world = World(slow, record=lambda images, columns: kept.append(images["touch"]))
+    world = World(Seeing(engine, difference=True), record=lambda images, columns: kept.append(images["touch"]))
     world.run(6)
     assert len(seen) > 20 and np.array_equal(kept[-1], world.rigs["touch"].picture)
     for touch in seen:
@@ -80,9 +71,13 @@ def test_a_model_of_difference_images_sees_a_touch_minus_its_background(engine: 
 
 def test_the_newest_frame_wins_and_the_rest_are_counted(engine: Engine) -> None:
     """Vision comes six times as fast as touch leads: five of six of its frames are never used."""
-    slow = Slow(engine)
-    world = World(slow)
-    slow.clock = world.clock
+
+    class Slow(Other):
+        def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
+            world.clock.now += 0.004
+            return super().__call__(**images)
+
+    world = World(Slow(engine))
     world.run(10, {"vision": 60.0, "touch": 10.0})
     age = world.live.summary()["age_ms"]  # from capture to answer
     assert age["p50"] == pytest.approx(4, abs=0.01) and age["max"] >= age["p99"] >= age["p50"]
@@ -450,17 +445,14 @@ def measuring(value_onnx: Path) -> Engine:
 def test_a_value_is_that_of_the_newest_frame_with_the_spread_of_its_range(measuring: Engine) -> None:
     given = iter([1.0, 5.0, 3.0, 3.0, 3.0])
 
-    class Rising(Slow):
+    class Rising(Other):
         """Says 1, 5, 3, 3, ... levels; errors are 0.25 below 2 levels and 0.5 from there."""
 
-        def __init__(self) -> None:
-            super().__init__(measuring)
-            self.values = {"light": [{"name": "level", "unit": "N", "edges": [2.0], "spread": [0.25, 0.5]}]}
-
         def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
-            return {**self.engine(**images), "value_light": np.array([[next(given, 3.0)]], np.float32)}
+            return {**super().__call__(**images), "value_light": np.array([[next(given, 3.0)]], np.float32)}
 
-    world, found = World(Rising()), []
+    values = {"light": [{"name": "level", "unit": "N", "edges": [2.0], "spread": [0.25, 0.5]}]}
+    world, found = World(Rising(measuring, values=values)), []
     while world.live.num_predictions < 3:
         before = world.live.num_predictions
         world.run(0.05)  # one frame
