@@ -1,7 +1,5 @@
 """One decoder: a picture has the same pixels in a pack, in ``find``, in ``live FOLDER`` and in ``Model.embed``."""
 
-from __future__ import annotations
-
 import os
 import zlib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Two packs as one: learned from is the one's train, scored the other's test, and nothing leaks between them."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

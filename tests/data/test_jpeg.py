@@ -1,7 +1,5 @@
 """Packs that store JPEG: what Pillow would decode, resumable to the same bytes, refused where damaged, and trained on."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

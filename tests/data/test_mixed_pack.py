@@ -1,7 +1,5 @@
 """Several packs as one: rows, images, tasks and splits are those of the parts, and what cannot be mixed is refused."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The pack: whole or not there, resumable to the same bytes, and never mistaken for something else."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import io

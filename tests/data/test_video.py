@@ -1,7 +1,5 @@
 """Frame i is frame i, whatever the codec does to the order; each is decoded once; damage is told, never painted over."""
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Windows: several frames of a touch as one row, by index, never across its edge."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """HDF5 files as people write them: one group or one per demonstration; each pixel and number beside its own row."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """Calandra's shards, built here in the owners' structure: nothing is lost, mixed up or leaked on the way to a table."""
 
-from __future__ import annotations
-
 import io
 import os
 import random

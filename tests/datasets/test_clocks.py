@@ -1,7 +1,5 @@
 """Two clocks: logs and second cameras joined by time, and recordings without a table."""
 
-from __future__ import annotations
-
 import copy
 import csv
 import json

@@ -1,7 +1,5 @@
 """Images inside something else: LeRobot datasets, parquet of the hub; each pixel beside its own row."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The generic reader: right pixels beside right labels, honest splits, and every mistake named before work begins."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

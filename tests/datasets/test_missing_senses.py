@@ -1,7 +1,5 @@
 """Rows that lack a modality: stored and marked, never trained on as a pair, never probed on what they lack."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

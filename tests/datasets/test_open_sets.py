@@ -1,7 +1,5 @@
 """Real sets as one ``git clone`` brings them: fixtures in the owners' exact layout, and the genuine samples beside us."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """ROS bags, written by rosbags itself: image and wrench topics joined by time."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

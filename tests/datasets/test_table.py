@@ -1,7 +1,5 @@
 """What a table of samples may hold beyond one file per image: videos, gaps, backgrounds, sensors, plain class folders."""
 
-from __future__ import annotations
-
 import csv
 import re
 from collections.abc import Sequence

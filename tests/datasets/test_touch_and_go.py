@@ -1,7 +1,5 @@
 """Touch and Go as published: the lists to their counts, the tree to its pairs, the splits to what they share."""
 
-from __future__ import annotations
-
 import os
 import resource
 import shutil

@@ -1,7 +1,5 @@
 """A plan becomes a table: finished runs are skipped, killed ones resumed to the same bits, p is what it says."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

@@ -1,7 +1,5 @@
 """Fine-tuning: settings from held-out groups of train alone, exact resumes, ancestors in the leaks."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The doctor: a healthy dataset is called healthy, and each of fourteen faults is called by its name and nothing else."""
 
-from __future__ import annotations
-
 import copy
 import json
 import re

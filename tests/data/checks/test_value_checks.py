@@ -1,7 +1,5 @@
 """The doctor on values: a healthy recording is called healthy, and each fault by its name and nothing else."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
