@@ -42,10 +42,6 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Pack:
     return jpeg_pack(tmp_path_factory.mktemp("jpeg") / "pack")
 
 
-def contents(path: Path) -> dict[str, bytes]:
-    return {name: (path / name).read_bytes() for name in FILES}
-
-
 # -- what is stored ---------------------------------------------------------------------------------------------------
 
 

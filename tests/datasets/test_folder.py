@@ -28,7 +28,6 @@ from mvitac.registry import from_json, to_json
 from mvitac.run import Run
 from mvitac.system.files import cache_dir
 
-REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
 NUM = 24
 Table = list[dict[str, Any]]
 
