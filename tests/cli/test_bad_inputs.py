@@ -306,11 +306,12 @@ PACK_FILES = ("pack.json", "samples.parquet", "vision.npy", "touch.npy")
 
 # A command, what is done to the copy of a pack or run, and what the message must hold.
 FILES: list[tuple[str, Spoil, str]] = [
-    *((INFO, within(name, spoil), name) for name, spoil in zip(PACK_FILES, DAMAGES.values(), strict=True)),
+    *((INFO, within(name, spoil), name) for name in PACK_FILES for spoil in DAMAGES.values()),
     *((PROBE, within(MODEL, spoil), MODEL) for spoil in DAMAGES.values()),
     *((AGAIN, within(CHECKPOINT, spoil), CHECKPOINT) for name, spoil in DAMAGES.items() if name != "missing"),
     *((REPEAT, within("run.json", spoil), "run.json") for spoil in DAMAGES.values()),
     (INFO, described("format_version", value=99), "format 99"),
+    (INFO, within("pack.json", write('{"name": "an npm package"}')), "does not describe a pack"),
     (INFO, within("pack.json", put("spec", "name", value="mine")), "digest"),
     (INFO, within("pack.json", write('{"name": "\\u001b[2J"}')), "control character"),
     (INFO, described("spec", "touch_channels", value=6), "touch.npy"),
