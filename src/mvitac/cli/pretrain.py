@@ -42,7 +42,7 @@ def pretrain(argv: list[str]) -> None:
       --data {"|".join(DatasetConfig.choices)}  (required; or the path of a pack, a table or a folder)
       --method {"|".join(MethodConfig.choices)}  (default mvitac)
       --from RUN.JSON   repeat a recorded run instead
-      --init RUN        start from its weights (also an artifact, or a .safetensors file)
+      --init RUN        start from its weights (also an artifact)
       --logger {"|".join(LOGGERS)}   also log there (extras; none by default)
     """
     usual = _Options(run=base, out=Path("runs") / f"{base.data.name}-{base.method.name}-{base.recipe}")

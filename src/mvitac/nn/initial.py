@@ -18,8 +18,8 @@ class Init:
     """Start weights from another model. Heads and modalities that are not taken start as the other settings say."""
 
     path: Annotated[Path | None, arg(name="init")] = None
-    """Folder of a finished run or of an artifact, `base` (the model that the package brings), or a .safetensors file
-    with weights. Adapted where the number of channels differs."""
+    """Folder of a finished run or of an artifact, its model.safetensors, or `base` (the model that the package brings).
+    Adapted where the number of channels differs. Weights of others: --encoder.weights FILE."""
     modalities: Fixed[tuple[Literal["vision", "touch"], ...]] = ()
     """Encoders to take. Default: all that fit, and at least one."""
     heads: Fixed[bool] = True
@@ -39,7 +39,7 @@ class Init:
         if not file.is_file():
             unfinished = "; its run is not finished, continue it with --resume" * (place / "checkpoint.pt").exists()
             what = f"init {file} does not exist{unfinished}"
-            raise ValueError(f"{what}: give a finished run, an artifact or .safetensors")
+            raise ValueError(f"{what}: give a finished run or an artifact")
         return file
 
     def resolved(self) -> "Init":

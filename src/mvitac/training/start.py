@@ -8,17 +8,14 @@ import numpy as np
 from torch import nn
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import MODALITIES
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, file_source, read_sources, unknown_source, weights_files
 from mvitac.methods.base import Method
 from mvitac.model import load
 from mvitac.nn.encoders import PerFrame
 from mvitac.nn.initial import Init
 from mvitac.nn.momentum import Momentum
-from mvitac.nn.weights import FORMAT, State, below, load_weights, misfit, read_safetensors
+from mvitac.nn.weights import State, below, load_weights, misfit
 from mvitac.run import Run
-
-ANY = "any"  # key of a trunk's weights in a file that does not say which modality they are for
 
 
 @dataclass(frozen=True)
@@ -26,32 +23,25 @@ class Start:
     """What a run starts from."""
 
     init: Init
-    trunks: dict[str, State]  # modality, or ``ANY``, -> state dict
+    trunks: dict[str, State]  # modality -> state dict
     heads: dict[str, State]  # modality -> state dict of the head into the shared space
-    trunk: str  # timm name of the trunks; "" if it is not known
+    trunk: str  # timm name of the trunks
     sources: list[Source]  # what its weights were trained on
-    sensors: tuple[str, ...] = ()  # touch sensors that they met, as far as the file says
+    sensors: tuple[str, ...]  # touch sensors that they met, as far as the file says
 
 
 def read_start(init: Init) -> Start | None:
-    """Read the weights of ``init``; None if it names none."""
+    """Read the model of ``init``; None if it names none."""
     if not init:
         return None
-    header, tensors = read_safetensors(init.file)
-    if header.get("format") == FORMAT:
-        model, folder = load(init.file), init.file.parent
-        trunks = {m: trunk.state_dict() for m, trunk in model.encoders.items()}
-        heads = {m: head.state_dict() for m, head in model.projectors.items()}
-        # Only the folder of a run or an artifact knows what its model learned from: a copied file is unknown.
-        own = init.file.name.startswith("model.") and (folder / "run.json").exists()
-        found = read_sources(folder) if own else None
-        learned = [unknown_source(folder.name if own else init.file.name)] if found is None else found
-        return Start(init, trunks, heads, model.run.encoder.named(model.encoders), learned, model.spec.sensors)
-    trunks, heads = (
-        {m: found for m in MODALITIES if (found := below(f"{kind}.{m}.", tensors))}
-        for kind in ("encoders", "projectors")
-    )
-    return Start(init, trunks or {ANY: tensors}, heads, "", [file_source(init.file)])
+    model, folder = load(init.file), init.file.parent
+    trunks = {m: trunk.state_dict() for m, trunk in model.encoders.items()}
+    heads = {m: head.state_dict() for m, head in model.projectors.items()}
+    # Only the folder of a run or an artifact knows what its model learned from: a copied file is unknown.
+    own = init.file.name.startswith("model.") and (folder / "run.json").exists()
+    found = read_sources(folder) if own else None
+    learned = [unknown_source(folder.name if own else init.file.name)] if found is None else found
+    return Start(init, trunks, heads, model.run.encoder.named(model.encoders), learned, model.spec.sensors)
 
 
 def load_trunk(trunk: nn.Module, state: State, file: Path | str = "it") -> None:
@@ -72,13 +62,13 @@ def load_start(start: Start, method: Method) -> dict[str, Any]:
     init, taken, reasons = start.init, {}, {}
     trunks, heads = method.encoders(), method.projectors()
     for modality in init.modalities or trunks:
-        state = start.trunks.get(modality, start.trunks.get(ANY))
+        if modality not in start.trunks:
+            reasons[modality] = f"it has {' and '.join(start.trunks)} only"
+            continue
         try:
-            if state is None:
-                raise ValueError(f"it has {' and '.join(start.trunks)} only")
-            load_trunk(trunks[modality], state, init.path or "")
+            load_trunk(trunks[modality], start.trunks[modality], init.path or "")
         except ValueError as error:
-            reasons[modality] = f"its trunk is {start.trunk}, {error}" if start.trunk and state else str(error)
+            reasons[modality] = f"its trunk is {start.trunk}, {error}"
             continue
         taken[modality] = ["trunk"]
         if init.heads and modality in heads and not misfit(heads[modality].state_dict(), start.heads.get(modality, {})):
