@@ -151,6 +151,7 @@ WORDS: list[tuple[str, str, str]] = [
     (PACKED, "--values endless:N", "'inf'"),
     (PACKED, "--values still:N", "'still'"),
     (PACKED, "--values farce:N", "did you mean 'force'"),
+    (PACKED, "--values force:N weight=force:mN", "two units"),
     (PACKED, "--labels force --values force:N", "'force'"),
 ]
 

@@ -126,6 +126,11 @@ class DataSpec:
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"task {name!r} occurs twice: give each task its own name")
+        units: dict[str, str] = {}
+        for target in (target for task in self.values for target in task.targets):
+            if units.setdefault(target.name, target.unit) != target.unit:
+                unit = units[target.name]
+                raise ValueError(f"{target.name!r} has two units, {unit} and {target.unit}: give a column one unit")
 
     @property
     def all_tasks(self) -> tuple[AnyTask, ...]:

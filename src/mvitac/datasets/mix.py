@@ -48,6 +48,8 @@ class MixConfig(DatasetConfig):
         weights = [weight for _, _, weight in self.named_parts()]
         if any(weights) and not all(weights):
             raise ValueError(f"parts {' '.join(self.parts)}: give every part a weight (NAME=FOLDER:WEIGHT), or none")
+        if any(weights) and self.temperature != 1:
+            raise ValueError(f"temperature {self.temperature} has no effect on parts with weights: leave one out")
 
     def named_parts(self) -> list[tuple[str, Path, float | None]]:
         """Name, folder and weight of each part."""
