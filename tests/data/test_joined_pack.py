@@ -126,10 +126,10 @@ def test_what_cannot_be_compared_is_refused(pack: Pack, negative: Pack, tmp_path
         JoinedPack(pack, build(Other(), tmp_path / "other", size=32, quiet=True))
     with pytest.raises(ValueError, match=r"class of pattern.*waves"):
         JoinedPack(pack, build(New(), tmp_path / "new", size=32, quiet=True))
-    with pytest.raises(ValueError, match=r"vision has 3 channels at 32 px in .*, 3 channels at 24 px in"):
+    with pytest.raises(ValueError, match=r"vision: 3 channels at 32 px in .*, 3 channels at 24 px in"):
         JoinedPack(pack, toy_pack(tmp_path / "small", size=24))
     alone = [toy_pack(tmp_path / f"touch{size}", size=size, vision_channels=0) for size in (24, 32)]
-    with pytest.raises(ValueError, match=r"touch has 3 channels at 24 px"):  # not the vision that both lack
+    with pytest.raises(ValueError, match=r"touch: 3 channels at 24 px"):  # not the vision that both lack
         JoinedPack(*alone)
 
 

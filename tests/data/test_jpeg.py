@@ -161,8 +161,8 @@ DAMAGES: dict[str, tuple[Callable[[Path], None], str]] = {
         flip,
         r"touch\.jpegs does not match its digest: the pack is damaged, make it again",
     ),
-    "truncated": (cut, r"touch\.jpegs holds \d+ bytes, its table promises \d+: .*damaged"),
-    "offsets": (lengths(longer), r"touch\.jpegs holds \d+ bytes, its table promises \d+"),
+    "truncated": (cut, r"touch\.jpegs .*holds \d+ bytes, its table promises \d+\): .*damaged"),
+    "offsets": (lengths(longer), r"touch\.jpegs .*holds \d+ bytes, its table promises \d+"),
     "no-offsets": (lengths(lambda _: None), r"unknown column 'bytes_touch'"),
     "called-png": (described("store", value="png"), r"pack\.json is damaged .*png"),
 }

@@ -204,7 +204,7 @@ def test_what_cannot_be_mixed_is_refused(pack: Pack, tmp_path: Path) -> None:
 
     cases: list[tuple[Toy, str]] = [
         (Scores(num=12), "part b .* has no rows in split train or unlabelled: leave it out"),
-        (Slice(num=12, touch_channels=6), "touch channels differ: 3 in a, 6 in b; pack them"),
+        (Slice(num=12, touch_channels=6), "touch channels differ: .*'a': 3, 'b': 6.; pack"),
         (Minus(num=12), "touch is minus its background in b and not in a: pack both alike"),
         (Toy(), "two of the parts a, b are the same data: give each pack once, with a weight"),
     ]

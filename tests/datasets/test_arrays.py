@@ -287,7 +287,7 @@ def test_numbers_of_more_than_8_bits(tmp_path: Path) -> None:
     write(tmp_path / "b.h5", {"touch": grays(*range(20)).astype(np.int64), "vision": (300 * deep[..., :1]).astype(int)})
     pack = packed(FolderConfig(**(options | {"path": tmp_path / "b.h5"}), vision=""), tmp_path / "i")
     assert levels(pack, "touch") == list(range(20))  # 8 bits, however they are stored
-    with pytest.raises(ValueError, match=r"its values lie in 268 to 268, not 0 to 255: --data\.range COLUMN=LOW:HIGH"):
+    with pytest.raises(ValueError, match=r"its values lie in 268 to 268, not 0 to 255: --data\.range"):
         packed(FolderConfig(**(options | {"path": tmp_path / "b.h5"})), tmp_path / "j")
     rows = []
     for i in range(20):  # a field of deformation in mm
@@ -295,7 +295,7 @@ def test_numbers_of_more_than_8_bits(tmp_path: Path) -> None:
         Image.fromarray(np.full((16, 16), 100 * i, np.uint16)).save(tmp_path / f"{i}.png")
         rows.append(f"{i}.npy,{i}.png,{i}")
     (tmp_path / "m.csv").write_text("touch,vision,take\n" + "\n".join(rows))
-    with pytest.raises(ValueError, match=r"its values lie in -1 to -1, not 0 to 1: --data\.range COLUMN=LOW:HIGH"):
+    with pytest.raises(ValueError, match=r"its values lie in -1 to -1, not 0 to 1: --data\.range"):
         packed(FolderConfig(path=tmp_path / "m.csv", size=16, group="take"), tmp_path / "no")
     config = FolderConfig(path=tmp_path / "m.csv", size=16, group="take", range=("touch=-1:1", "vision=0:1900"))
     pack = packed(config, tmp_path / "r")
@@ -339,7 +339,7 @@ BAD: dict[str, tuple[dict[str, Any], dict[str, str], str]] = {
     "channels first": (
         flat(gel=np.zeros((20, 3, 16, 16), np.uint8)),
         {},
-        r"/gel is uint8 \[20, 3, 16, 16\]: images are",
+        r"/gel is uint8 \[20, 3, 16, 16\], not \[N, H, W",
     ),
     "text for a number": (
         flat(force_n=["1", "2 N"] * 10),

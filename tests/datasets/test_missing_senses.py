@@ -14,7 +14,7 @@ from mvitac.datasets.pack import PackConfig
 from mvitac.deploy import search
 from mvitac.deploy.export import ExportConfig, _examples, export
 from mvitac.deploy.export_module import ExportModule
-from mvitac.deploy.publish import fit_probes
+from mvitac.deploy.publish import with_probes
 from mvitac.evaluation import sensors
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.probe import split_rows
@@ -110,7 +110,7 @@ def model(holes: Pack, tmp_path_factory: pytest.TempPathFactory) -> Model:
 
 
 def test_published_probes_are_of_what_is_there(holes: Pack, model: Model) -> None:
-    found = fit_probes(model, holes)
+    found = with_probes(model, holes).probes
     for task in holes.spec.tasks:
         for modality in ("vision", "touch", "both"):
             assert found[f"{task.name}.{modality}"].info.num_test == len(split_rows(holes, task, modality).test)

@@ -47,8 +47,7 @@ def pack(argv: list[str]) -> None:
     check_place(options.out)
     data: Any = options.data
     if data.frame_window() != Window():
-        what = "a pack stores every frame once: leave out options of windows (--num-frames, --stride, ...)"
-        raise ValueError(f"{what}, and give them to the commands that read the pack")
+        raise ValueError("a pack stores every frame once: give --num-frames, --stride, ... to what reads the pack")
     given = {"max_damaged": options.max_damaged, "quiet": options.quiet, **data.build_options()}
     pack = build(data.source(), options.out, **given)
     print(f"{pack.path}: {pack.num} samples at {pack.size} px")

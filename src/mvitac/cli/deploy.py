@@ -2,9 +2,8 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
 from tyro.conf import Positional
 
 from mvitac.cli.options import check_models, loading, parse
@@ -58,8 +57,6 @@ class _ExportOptions(ExportConfig):
     new_sensor: Path | None = None
     """Pack with 64 to 400 unlabelled images of a touch sensor that the model never met, such as a recording of mvitac
     live: the export is for that sensor, and shows its images in the colours of the known ones."""
-    num_rows: Annotated[int, tyro.conf.arg(name="rows")] = 512
-    """Maximum number of test rows to check on."""
 
 
 def export(argv: list[str]) -> None:

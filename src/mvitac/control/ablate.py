@@ -124,7 +124,7 @@ def suite_episodes(suite: Any, cell: tuple[str, ...]) -> Episodes:
 
 def suite_policy(suite: Any, cell: tuple[str, ...], text: str) -> Policy:
     """A policy that ``open_policy`` takes; or that of an encoder, or of "pixels", which learns as rows of the suite do."""
-    if _is_lerobot(text) or (":" in text and not text.startswith("external:")):
+    if (Path(text) / "config.json").is_file() or (":" in text and not text.startswith("external:")):
         return open_policy(text)
     learn = ridge(pixels if text == "pixels" else encoding(load(text)))
     estimate, world = learn(*suite.taught(suite.lesson(cell))), suite.world(*cell, 0)
@@ -133,7 +133,7 @@ def suite_policy(suite: Any, cell: tuple[str, ...], text: str) -> Policy:
 
 def open_policy(text: str) -> Policy:
     """The policy that ``text`` names: FILE.py:function, or the folder of a LeRobot policy."""
-    if _is_lerobot(text):
+    if (Path(text) / "config.json").is_file():
         return lerobot_policy(Path(text))
     file, _, name = text.rpartition(":")
     if not file.endswith(".py"):
@@ -142,10 +142,6 @@ def open_policy(text: str) -> Policy:
         return runpy.run_path(file)[name]
     except (Exception, SystemExit) as error:  # whatever the owner's code raises
         raise ValueError(f"{text} cannot be imported ({type(error).__name__}: {brief(error)})") from None
-
-
-def _is_lerobot(text: str) -> bool:
-    return (Path(text) / "config.json").is_file()
 
 
 def lerobot_policy(folder: Path) -> Policy:

@@ -93,9 +93,7 @@ def to_gray(values: np.ndarray, span: Sequence[float], clip: bool) -> np.ndarray
     low, high = span
     least, most = float(values.min()), float(values.max())
     if not np.isfinite(values).all() or (not clip and (least < low or most > high)):
-        raise ValueError(
-            f"its values lie in {least:g} to {most:g}, not {low:g} to {high:g}: --data.range COLUMN=LOW:HIGH"
-        )
+        raise ValueError(f"its values lie in {least:g} to {most:g}, not {low:g} to {high:g}: --data.range")
     return np.rint(np.clip((values - np.float64(low)) / (high - low), 0, 1) * 255).astype(np.uint8)
 
 

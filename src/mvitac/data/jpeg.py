@@ -58,7 +58,7 @@ class Jpegs(Lazy):
         self.path = path
         self._ends = np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)])
         if (held := path.stat().st_size) != self._ends[-1]:
-            raise ValueError(f"{path} holds {held} bytes, its table promises {self._ends[-1]}")
+            raise ValueError(f"it holds {held} bytes, its table promises {self._ends[-1]}")
         self._file = np.memmap(path, np.uint8, "r") if held else np.zeros(0, np.uint8)  # an empty file cannot be mapped
 
     def _made(self, rows: np.ndarray) -> np.ndarray:

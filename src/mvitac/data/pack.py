@@ -65,8 +65,7 @@ class Pack:
         except ValueError as error:
             raise ValueError(f"{self.path / 'pack.json'} is damaged ({error}): re-pack it") from None
         self.table: pa.Table = self._read_table()
-        read = {"raw": self._map, "jpeg": self._jpegs}[self.store]
-        self.images: dict[str, Images] = {m: read(m, self._file(name)) for name, m in files.items()}
+        self.images: dict[str, Images] = {m: self._opened(m, self._file(name)) for name, m in files.items()}
         for name in files if verify else ():
             self._check_digest(name)
 
@@ -266,15 +265,11 @@ class Pack:
     def _shape(self, modality: str, num: int) -> tuple[int, int, int, int]:
         return num, self.size, self.size, self.spec.channels(modality)
 
-    def _jpegs(self, modality: str, path: Path) -> Jpegs:
-        try:
-            return Jpegs(path, self._shape(modality, self.num), self.column(f"bytes_{modality}"))
-        except (ValueError, OSError) as error:
-            raise ValueError(f"{brief(error)}: the pack is damaged, make it again") from None
-
-    def _map(self, modality: str, path: Path) -> np.ndarray:
+    def _opened(self, modality: str, path: Path) -> Images:
         expected = self._shape(modality, self.num)
         try:
+            if self.store == "jpeg":
+                return Jpegs(path, expected, self.column(f"bytes_{modality}"))
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # about damaged headers
                 images = np.load(path, mmap_mode="r", allow_pickle=False)

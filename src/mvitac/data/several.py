@@ -137,8 +137,7 @@ def _check_parts(parts: Mapping[str, Pack]) -> None:
     for modality in MODALITIES:
         given = {name: num for name, pack in parts.items() if (num := pack.spec.channels(modality))}
         if len(set(given.values())) > 1:
-            counts = ", ".join(f"{num} in {name}" for name, num in given.items())
-            raise ValueError(f"{modality} channels differ: {counts}; pack them with the same number of sensors")
+            raise ValueError(f"{modality} channels differ: {given}; pack all with the same number of sensors")
     minus = {pack.spec.difference: name for name, pack in parts.items() if pack.spec.touch_channels}
     if len(minus) > 1:
         raise ValueError(f"touch is minus its background in {minus[True]} and not in {minus[False]}: pack both alike")
@@ -270,9 +269,7 @@ class JoinedPack(_Several):
             shapes = [(pack.size, pack.spec.channels(modality)) for pack in (learn, score)]
             if any(num for _, num in shapes) and shapes[0] != shapes[1]:
                 each = [f"{num} channels at {size} px" for size, num in shapes]
-                raise ValueError(
-                    f"{modality} has {each[0]} in {learn.path}, {each[1]} in {score.path}: pack both alike"
-                )
+                raise ValueError(f"{modality}: {each[0]} in {learn.path}, {each[1]} in {score.path}: pack both alike")
         tasks = _common_tasks(learn, score)
         learned = _side(learn, tasks, "learned", {"train", "val"})
         scored = _side(score, tasks, "scored", {"test"})

@@ -117,7 +117,7 @@ def _measure(
     model: Model, graph: ExportModule, path: Path, pack: Pack, rows: np.ndarray, config: ExportConfig
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     engine = "openvino" if config.precision == "bf16" else "auto"
-    call = open_model(path, engine, config.precision, config.threads)
+    call = open_model(path, engine, config.precision)
     with work("checking the outputs of the export"):
         wanted = reference(model, graph, pack, rows)
         report = parity(graph, call, pack, rows, wanted, **config.tolerance)

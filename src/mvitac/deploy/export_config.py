@@ -1,9 +1,9 @@
 """``ExportConfig``: what `mvitac export` writes. It imports no torch."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from tyro.conf import Fixed
+from tyro.conf import Fixed, arg
 
 Precision = Literal["fp32", "bf16", "int8"]
 MIN_COSINE = {"fp32": 0.9999, "bf16": 0.99, "int8": 0.95}
@@ -25,10 +25,8 @@ class ExportConfig:
     """Points of accuracy (percent) that any one task may lose on the test rows."""
     value_loss: float = 0.1
     """Change of any predicted value on the test rows (root mean square), in standard deviations of that value."""
-    num_rows: int = 512
+    num_rows: Annotated[int, arg(name="rows")] = 512
     """Maximum number of test rows to check on."""
-    threads: int = 0
-    """CPU threads while measuring latency; 0 = all cores."""
 
     @property
     def tolerance(self) -> dict[str, float]:

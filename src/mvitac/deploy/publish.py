@@ -35,16 +35,12 @@ NUM_RANGES, RANGE_ROWS = 8, 20
 """Most ranges of a predicted value that have an error of their own, and fewest test rows in one."""
 
 
-def fit_probes(model: Model, pack: Pack) -> dict[str, LinearProbe]:
-    """The linear probe of every task and modality of ``pack`` by name, fitted and scored exactly as by ``mvitac probe``.
+def fit_probes(model: Model, pack: Pack) -> list[tuple[LinearProbe, dict[str, Any]]]:
+    """The linear probe of every task and modality of ``pack``, and its record, as fitted and scored by ``mvitac probe``.
 
     That of a task with values is ridge regression. A task without labelled rows in train and test has none: a probe that
     cannot be scored is not published.
     """
-    return {probe.info.name: probe for probe, _ in _fit_all(model, pack)}
-
-
-def _fit_all(model: Model, pack: Pack) -> list[tuple[LinearProbe, dict[str, Any]]]:
     modalities = [m for m in pack.spec.modalities if m in model.encoders]
     tasks = {m: scorable(pack, m) for m in (*modalities, *(["both"] if len(modalities) == 2 else []))}
     records: Records = []
@@ -137,7 +133,7 @@ def own_data(model: Model, instead: str, *, few: bool = False) -> Pack:
 def with_probes(model: Model, pack: Pack) -> Model:
     """``model`` with probes: its own if it has some (an artifact), else fitted on ``pack``."""
     if not model.probes:
-        model.probes = fit_probes(model, as_trained(model, pack))
+        model.probes = {probe.info.name: probe for probe, _ in fit_probes(model, as_trained(model, pack))}
     return model
 
 
@@ -145,7 +141,7 @@ def _fit_and_score(run: Path, model: Model, pack: Pack, allow_leak: bool) -> tup
     """Fit the probes of ``model``; returns what it learned from, if that is known, and the scores of ``_scores``."""
     tasks = {task.name: task for task in scorable(pack)}
     learned, scored = check_unseen([run], pack, [*tasks.values()], allow_leak=allow_leak)[0], Scored(pack)
-    fitted = _fit_all(model, pack)
+    fitted = fit_probes(model, pack)
     for probe, record in fitted:
         q = probe.info
         record["leak"] = scored.leak(learned, split_rows(pack, tasks[q.task], q.modality).test)

@@ -241,8 +241,7 @@ def recording(text: str) -> Recording:
     if not 0 < fps < float("inf"):
         raise ValueError(f"source {text!r}: {fps} is no frame rate")
     if not (path.is_dir() or path.suffix.lower() in VIDEOS):
-        how = f"give a video ({', '.join(VIDEOS)}) or a folder[@fps]; live: or a camera or sim"
-        raise ValueError(f"source {text!r}: {how}")
+        raise ValueError(f"source {text!r}: give a video ({', '.join(VIDEOS)}), a folder[@fps], a camera or sim")
     files = Folder(path, fps) if path.is_dir() else Video(path)
     files.crop = crop
     try:  # now: unlike a camera, a missing file does not come back

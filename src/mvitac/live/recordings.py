@@ -96,9 +96,7 @@ class Recordings:
         self.calibrated = all(self._calibrate(stream.name, stream.origin) for stream in streams.get("touch", ()))
         if self.live.minus_rest and not self.calibrated:
             num = config.calibration
-            raise ValueError(
-                f"the model needs the sensor without contact, and no {num} frames show it: give --background"
-            )
+            raise ValueError(f"no {num} frames show the sensor without contact, as the model needs: give --background")
         self.num = len(self.leading.times)
 
     def _calibrate(self, name: str, file: Recording) -> bool:

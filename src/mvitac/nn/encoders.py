@@ -209,8 +209,7 @@ def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:
         try:
             return timm.create_model(config.trunk, **arguments)
         except Exception as error:  # an unknown tag, or a trunk that does not support this number of channels
-            why = f"for {channels} channels ({brief(error)})"
-            raise ValueError(f"trunk {config.trunk} cannot be created {why}: give another") from None
+            raise ValueError(f"trunk {config.trunk} cannot be made for {channels} channels ({brief(error)})") from None
     if config.weights != IMAGENET:
         # Checked here, not in the config: a finished run must load after the file of its initial weights is gone.
         if not Path(config.weights).is_file():

@@ -98,8 +98,7 @@ class LinearProbe(nn.Module):
         num, tensors = len(info.outputs), [weight, bias] + ([] if bounds is None else [bounds])
         wanted = [(num, weight.shape[-1]), (num,), (2, weight.shape[-1])]
         if any(tensor.shape != shape for tensor, shape in zip(tensors, wanted, strict=False)):
-            found = ", ".join(str(tuple(tensor.shape)) for tensor in tensors)
-            raise ValueError(f"probe {info.name}: tensors of shapes {found} do not fit {num} outputs")
+            raise ValueError(f"probe {info.name}: the shapes of its tensors do not fit {num} outputs")
         if not all(tensor.dtype == torch.float32 and tensor.isfinite().all() for tensor in tensors):
             raise ValueError(f"probe {info.name}: its weights are not all finite float32")
         self.info = info

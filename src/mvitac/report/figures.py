@@ -20,7 +20,7 @@ from matplotlib.ticker import MaxNLocator
 
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import percent
-from mvitac.report.html import COLOURS, CONTROL_GREYS, HUES, MODALITY_HUES, data_uri
+from mvitac.report.html import COLOURS, CONTROL_GREYS, MODALITY_HUES, data_uri
 
 DASHES = ("-", "--", ":", "-.")
 BELOW: Any = "outside lower center"  # of legends, where they hide nothing
@@ -50,7 +50,7 @@ def bars(
 ) -> Figure:
     """Horizontal bars in percent with 95 % whiskers. Methods have their modality's colour, controls are grey.
 
-    ``groups``: modality or direction -> source -> mean, low and high, at most 1; ``low`` None: no whisker. ``lines``
+    ``groups``: modality -> source -> mean, low and high, at most 1; ``low`` None: no whisker. ``lines``
     are vertical ones across all groups, such as majority or chance. ``what`` labels the axis.
     """
     num_rows = sum(len(group) + 1.25 for group in groups.values())
@@ -58,11 +58,9 @@ def bars(
     y, ticks, spans, top = 0.0, {}, [], max([0.0, *lines.values()])
     lows = [cell[k] for group in groups.values() for cell in group.values() for k in ("mean", "low")]
     least = max(LEAST, min(0.0, *(low for low in lows if low is not None)))
-    for number, (group, cells) in enumerate(groups.items()):
-        hue = MODALITY_HUES.get(group, HUES[2 + 2 * (number % 2)])
-        axes.text(
-            100 * least, y, group.replace("->", "→"), color=COLOURS[hue], fontweight="bold", va="center", ha="left"
-        )
+    for modality, cells in groups.items():
+        hue = MODALITY_HUES[modality]
+        axes.text(100 * least, y, modality, color=COLOURS[hue], fontweight="bold", va="center", ha="left")
         spans.append((y + 0.5, y + len(cells) + 0.5))
         for source, cell in cells.items():
             y += 1
@@ -211,9 +209,9 @@ def _print(figure: Figure, kind: str, metadata: dict[str, Any], **options: Any) 
     return buffer.getvalue()
 
 
-def to_png(figure: Figure, dpi: int = 200) -> bytes:
+def to_png(figure: Figure) -> bytes:
     """The figure as a PNG on white."""
-    figure.set_dpi(dpi)
+    figure.set_dpi(dpi := 200)
     return _print(figure, "png", {"Software": None}, facecolor="white", dpi=dpi)
 
 

@@ -148,8 +148,7 @@ def _images(file: Path, name: str, datasets: dict[str, Any], images: Collection[
     for data in shown.values():
         numbers = data.ndim == 4 and data.dtype.kind in "uif" and data.shape[3] in (1, 2, 3) and 0 not in data.shape[1:]
         if not numbers and not (data.ndim < 4 and _holds_images(data)):
-            need = "images are [rows, height, width, 1 to 3] or JPEG or PNG files"
-            raise ValueError(f"{file}: {data.name} is {data.dtype} {list(data.shape)}: {need}")
+            raise ValueError(f"{file}: {data.name} is {data.dtype} {list(data.shape)}, not [N, H, W, 1 to 3] or files")
         if numbers and (pixels := data.shape[1] * data.shape[2]) > MAX_PIXELS:
             raise ValueError(f"{file}: images of {data.name} have {pixels:,} pixels: at most {MAX_PIXELS:,} are read")
     (first, num), *others = ((data.name, data.shape[0]) for data in shown.values())

@@ -209,7 +209,10 @@ class Rows(Source):
         missing = images.check_present(table, asked, config.allow_missing)
         stamps = images.check_files(table, self._images, grounds)
 
-        group_by, groups = self._grouping(table)
+        if self._group:
+            group_by, groups = self._group, table.filled(self._group, "group")
+        else:
+            group_by, groups = splits.group_by_video(table.root, table.numbers, [table.images[c] for c in self._images])
         touch_groups = table.filled(config.touch_group, "touch_group") if config.touch_group else groups
         counts = all_hold(config.label_only, table)
         read = [columns.read_task(table, column, counts) for column in label_columns]
@@ -265,12 +268,6 @@ class Rows(Source):
         kept = [not none for none in empty]
         found = [ground for ground, keep in zip(found, kept, strict=True) if keep]
         return table.kept(kept, f"every row meets {' and '.join(config.no_contact)}"), found
-
-    def _grouping(self, table: Manifest) -> tuple[str, list[str]]:
-        """Return what a group is, and the group of each row."""
-        if self._group:
-            return self._group, table.filled(self._group, "group")
-        return splits.group_by_video(table.root, table.numbers, [table.images[column] for column in self._images])
 
     def _assign(
         self,
