@@ -28,15 +28,15 @@ def retrieved_rows(pack: Pack, split: str = "test") -> np.ndarray:
     return pack.rows(split, only=only, having=pack.spec.modalities)
 
 
-def cross_modal(model: Model, pack: Pack, rows: np.ndarray | None = None) -> list[dict[str, Any]]:
-    """Retrieval of groups across modalities among ``rows`` (default: ``retrieved_rows``), one record per direction.
+def cross_modal(model: Model, pack: Pack) -> list[dict[str, Any]]:
+    """Retrieval of groups across modalities among ``retrieved_rows``, one record per direction.
 
     A record has R@1, R@5, R@10, chance level R@5 and the hits at 5 of each group. There is none without a shared space,
     on data of one modality, or with fewer than ``MIN_GALLERY`` groups.
     """
     if len(model.projectors) < 2 or len(pack.spec.modalities) < 2:
         return []
-    rows = retrieved_rows(pack) if rows is None else rows
+    rows = retrieved_rows(pack)
     sizes = np.bincount(group_numbers(pack, rows))
     if len(sizes) < MIN_GALLERY:
         return []
