@@ -43,6 +43,15 @@ class Touch:
 class Live:
     """Predictions from streams of frames. Call ``tick`` whenever a frame may have come."""
 
+    max_age = 0.0
+    num_predictions = num_stale = num_touches = 0
+    touch: Touch | None = None
+    last: Touch | None = None
+    answer: Touch | None = None
+    """What the latest prediction says: the current touch, or a frame without contact (``always``)."""
+    contact: bool | None = None
+    _seen = -1
+
     def __init__(
         self,
         engine: Engine,
@@ -92,16 +101,8 @@ class Live:
         self.counts: Counter[str] = Counter()
         self.ages: deque[float] = deque(maxlen=NUM_AGES)
         """Seconds from the capture of the leading frame to the answer, the latest prediction's last."""
-        self.max_age = 0.0
-        self.num_predictions = self.num_stale = self.num_touches = 0
-        self.touch: Touch | None = None
-        self.last: Touch | None = None
-        self.answer: Touch | None = None
-        """What the latest prediction says: the current touch, or a frame without contact (``always``)."""
         self.outputs: dict[str, np.ndarray] = {}
         """Of the engine, for the latest prediction."""
-        self.contact: bool | None = None
-        self._seen = -1
         self._judged: dict[str, int] = {}
         self._changed: set[str] = set()
         for stream in self.all:

@@ -184,7 +184,6 @@ class Rows(Source):
 
     def __init__(self, config: RowsConfig) -> None:
         self._config = config
-        self._title = config.title or (config.path if config.path.is_dir() else config.path.parent).resolve().name
         table = config.manifest()
         if config.log:
             names = [name for name in (*config.touch, config.vision, "touch", "left", "right", "vision") if name]
@@ -200,15 +199,14 @@ class Rows(Source):
         label_columns = config.labels or table.labels
         value_tasks = [value_task(text) for text in config.values]
         targets = [target.name for task in value_tasks for target in task.targets]
-        split = None if self._split == BY_GROUP else self._split
-        table.check(*label_columns, *targets, self._group, split, self._sensor, config.touch_group)
+        used = (*label_columns, *targets, self._group, *({self._split} - {BY_GROUP}), self._sensor, config.touch_group)
+        table.check(*used)
         table.check(*config.conditioned(), *(c for used in config.control_columns().values() for c in used))
 
         table, grounds = self._select(table)
         asked = {"vision": self._images[: bool(self._vision)], "touch": self._touch}
         missing = images.check_present(table, asked, config.allow_missing)
         stamps = images.check_files(table, self._images, grounds)
-
         if self._group:
             group_by, groups = self._group, table.filled(self._group, "group")
         else:
@@ -230,10 +228,9 @@ class Rows(Source):
 
         row_bytes = 3 * config.size**2 * len(self._images)
         self._items = bundles(self._rows, max(1, min(MAX_TOGETHER, MAX_TOGETHER_BYTES // row_bytes)))
-        used = [[ref for i in item for ref in self._rows[i].refs()] for item in self._items]
-        self._stamps = [one_stamp(stamps[ref.path] for ref in refs) for refs in used]
+        self._stamps = [one_stamp(stamps[r.path] for i in item for r in self._rows[i].refs()) for item in self._items]
         self._spec = DataSpec(
-            name=self._title,
+            name=config.title or (config.path if config.path.is_dir() else config.path.parent).resolve().name,
             vision_channels=3 if self._vision else 0,
             touch_channels=3 * len(self._touch),
             tasks=tuple(task for task, _ in read),
@@ -350,7 +347,7 @@ class Rows(Source):
     def fingerprint(self) -> dict[str, Any]:
         return {
             "reader": f"{self._config.name} {VERSION}",
-            "title": self._title,
+            "title": self._spec.name,
             "manifest": self._digest,
             "options": {k: v for k, v in to_json(self._config).items() if k not in ("path", *KEEPING)},
         }
