@@ -41,7 +41,6 @@ from mvitac.evaluation.leaks import (
 from mvitac.evaluation.score_text import with_interval
 from mvitac.evaluation.scores import pool, summarise
 from mvitac.nn.encoders import build_trunk
-from mvitac.nn.initial import Init
 from mvitac.report.report import write_report
 from mvitac.report.tables import unseen_groups
 from mvitac.system.files import read_json
@@ -271,14 +270,14 @@ def test_start_weights_of_which_their_owner_says_it(
     text: str, leak: str, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = weights(pack, tmp_path, text)
-    train(replace(smoke(pack, init=Init(path=file)), steps=1), tmp_path / "run", quiet=True)
+    run = smoke(pack)
+    run = replace(run, encoder=run.encoder.changed(weights=str(file)), steps=1)
+    train(run, tmp_path / "run", quiet=True)
     told = capsys.readouterr().err
     assert ("leaks of test rows cannot be excluded" in told) == (leak == UNKNOWN) and (leak in told or leak == UNKNOWN)
     own, theirs = read_sources(tmp_path / "run") or []
     assert own.name == "toy" and theirs.name == (f"{DECLARED}{text}" if text else "theirs.safetensors")
     assert Scored(pack).leak([theirs], pack.rows("test")) == leak
-    run = smoke(pack)
-    run = replace(run, encoder=run.encoder.changed(weights=str(file)))
     assert [file_source(file).name for file in weights_files(run)] == [theirs.name]
     encoder = open_model(f"external:timm/{run.encoder.touch.trunk},weights={file},size=32")
     assert encoder.trained_on == (text or UNKNOWN)
