@@ -307,9 +307,7 @@ FORGED: dict[str, tuple[Change, str]] = {
 
 
 @pytest.mark.parametrize("kind", FORGED)
-def test_a_forged_result_is_refused(
-    kind: str, results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_forgery_is_refused(kind: str, results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It was signed again by someone who wants to hide what was changed."""
     change, words = FORGED[kind]
     forged = changed(results[0], tmp_path / "a.json", change, signed=True)

@@ -116,13 +116,9 @@ def test_what_cannot_be_compared_is_refused(pack: Pack, negative: Pack, tmp_path
             spec = super().spec()
             return replace(spec, tasks=(Task(name="pattern", classes=("columns", "rows", "waves")),))
 
-    with pytest.raises(
-        ValueError, match=r"instance '.*' is learned from in .* and scored in .*, one of \d+: give packs"
-    ):
+    with pytest.raises(ValueError, match=r"instance '.*' is learned from in .* and scored in .*, one of \d+"):
         JoinedPack(pack, build(Shuffled(), tmp_path / "shuffled", size=32, quiet=True))
-    with pytest.raises(
-        ValueError, match=r"no task is in both packs: .* has pattern, bright, .* other pattern, other bright"
-    ):
+    with pytest.raises(ValueError, match=r"no task is in both packs: .* has pattern, bright, .* other pattern"):
         JoinedPack(pack, build(Other(), tmp_path / "other", size=32, quiet=True))
     with pytest.raises(ValueError, match=r"class of pattern.*waves"):
         JoinedPack(pack, build(New(), tmp_path / "new", size=32, quiet=True))

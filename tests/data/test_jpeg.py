@@ -26,7 +26,7 @@ from mvitac.training.loop import train
 from mvitac.training.sampler import Batches
 from mvitac.training.views import StepViews
 from support.forged_packs import described, seal
-from support.toy import Toy
+from support.toy import Holes, Toy
 from support.training_runs import assert_equal_weights, smoke
 
 FILES = ("pack.json", "samples.parquet", "vision.jpegs", "touch.jpegs")
@@ -97,13 +97,6 @@ def test_two_sensors_keep_apart(tmp_path: Path) -> None:
 
 
 def test_a_missing_image_has_no_bytes(tmp_path: Path) -> None:
-    class Holes(Toy):
-        def read(self, item: int) -> list[Sample]:
-            (sample,) = super().read(item)
-            there = item % 3 != 1
-            touch = sample.touch if there else None
-            return [replace(sample, touch=touch, columns={**sample.columns, "has_touch": there})]
-
     found = jpeg_pack(tmp_path / "p", Holes(num=12), quality=3)
     assert ((found.column("bytes_touch") == 0) == ~found.has("touch")).all()
     assert ((found.images["touch"][:] == 0).all((1, 2, 3)) == ~found.has("touch")).all()
@@ -157,10 +150,7 @@ def flip(path: Path) -> None:
 
 
 DAMAGES: dict[str, tuple[Callable[[Path], None], str]] = {
-    "bit": (
-        flip,
-        r"touch\.jpegs does not match its digest: the pack is damaged, make it again",
-    ),
+    "bit": (flip, r"touch\.jpegs does not match its digest: the pack is damaged, make it again"),
     "truncated": (cut, r"touch\.jpegs .*holds \d+ bytes, its table promises \d+\): .*damaged"),
     "offsets": (lengths(longer), r"touch\.jpegs .*holds \d+ bytes, its table promises \d+"),
     "no-offsets": (lengths(lambda _: None), r"unknown column 'bytes_touch'"),

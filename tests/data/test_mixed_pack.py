@@ -166,9 +166,7 @@ class Turned(Slice):
 
 def test_a_group_on_two_sides_is_refused_or_marked(pack: Pack, tmp_path: Path) -> None:
     turned = built(Turned(num=60), tmp_path / "p")
-    with pytest.raises(
-        ValueError, match=r"instance '0-6' is in train of part b and in test of part a, one of \d+: pack"
-    ):
+    with pytest.raises(ValueError, match=r"instance '0-6' is in train of part b and in test of part a, one of \d+"):
         MixedPack({"b": turned, "a": pack})
     mix = MixedPack({"a": pack, "b": turned}, allow_leak=True)
     assert mix.spec.notes[0].startswith("instance")
@@ -215,7 +213,7 @@ def test_what_cannot_be_mixed_is_refused(pack: Pack, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("given", "says"),
     [
         (["a=x", "a=y"], "part 'a' is given twice"),
         (["a=x:2", "b=y"], r"parts a=x:2 b=y: give every part a weight \(NAME=FOLDER:WEIGHT\), or none"),
@@ -224,15 +222,13 @@ def test_what_cannot_be_mixed_is_refused(pack: Pack, tmp_path: Path) -> None:
         (["a=x", "b=y"], "part a: no pack at x"),
     ],
 )
-def test_a_mistake_is_one_line(
-    given: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_mistake_is_one_line(given: list[str], says: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     import re
 
     asked = ["pretrain", "--data", "mix", "--recipe", "smoke", "--out", str(tmp_path / "run"), "--data.parts", *given]
     assert main(asked) == 2
     said = capsys.readouterr().err
-    assert re.search(message, said) and said.count("\n") == 1 and not (tmp_path / "run").exists()
+    assert re.search(says, said) and said.count("\n") == 1 and not (tmp_path / "run").exists()
 
 
 def test_names_folders_and_weights() -> None:
@@ -241,16 +237,13 @@ def test_names_folders_and_weights() -> None:
     assert MixConfig(parts=("a=b=c", "d:e/f")).named_parts() == [("a", Path("b=c"), None), ("f", Path("d:e/f"), None)]
 
 
-def test_a_mix_is_described_shown_and_checked(
+def test_a_mix_is_described_and_checked(
     pack: Pack, gel: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     parts = [f"toy={pack.path}", f"gel={gel.path}"]
     assert main(["data", "info", *parts, "--json", str(tmp_path / "info.json")]) == 0
     found = json.loads((tmp_path / "info.json").read_text())
-    assert (found["rows"], found["rows_without"]) == (
-        pack.num + gel.num,
-        {"vision": gel.num},
-    )
+    assert (found["rows"], found["rows_without"]) == (pack.num + gel.num, {"vision": gel.num})
     written = ["--json", str(tmp_path / "check.json"), "--sheet", str(tmp_path / "x.png")]
     assert main(["data", "check", *parts, *written]) in (0, 1) and (tmp_path / "x.png").stat().st_size
     assert main(["data", "pack", "--data", "mix", "--out", str(tmp_path / "p")]) == 2

@@ -294,20 +294,6 @@ def test_a_script_without_a_main_guard_is_told(tmp_path: Path) -> None:
     assert done.stderr.count(b"Traceback") == 1
 
 
-def copy_of(pack: Pack, path: Path) -> Path:
-    shutil.copytree(pack.path, path)
-    return path
-
-
-def test_one_flipped_bit_is_noticed(pack: Pack, tmp_path: Path) -> None:
-    path = copy_of(pack, tmp_path / "p") / "touch.npy"
-    data = bytearray(path.read_bytes())
-    data[-1] ^= 1
-    path.write_bytes(data)
-    with pytest.raises(ValueError, match=r"touch\.npy does not match its digest"):
-        Pack(path.parent)
-
-
 def free(monkeypatch: pytest.MonkeyPatch, num_bytes: int) -> None:
     monkeypatch.setattr(packing.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, num_bytes))  # type: ignore[attr-defined]
 

@@ -331,27 +331,11 @@ def test_a_crop_is_cut_out_of_images_and_backgrounds(tmp_path: Path) -> None:
 BAD: dict[str, tuple[dict[str, Any], dict[str, str], str]] = {
     "dataset missing": (flat(gel=None), {}, r"has no image dataset 'gel' \(it has camera \[20, 16, 20, 3\]\)"),
     "lengths of images": (flat(gel=grays(1, 2)), {}, "/gel has 2 rows, /camera has 20"),
-    "length of a number": (
-        flat(force_n=np.arange(9)),
-        {},
-        r"force_n is int64 \[9\] in a: .*for each of the 20 images",
-    ),
-    "channels first": (
-        flat(gel=np.zeros((20, 3, 16, 16), np.uint8)),
-        {},
-        r"/gel is uint8 \[20, 3, 16, 16\], not \[N, H, W",
-    ),
-    "text for a number": (
-        flat(force_n=["1", "2 N"] * 10),
-        {},
-        r"row 2 \(a/1\): force_n is '2 N': give a finite number",
-    ),
+    "length of a number": (flat(force_n=np.arange(9)), {}, r"force_n is int64 \[9\] in a: .*for each of the 20 images"),
+    "channels first": (flat(gel=np.zeros((20, 3, 16, 16), np.uint8)), {}, r"/gel is uint8 \[20, 3, 16, 16\], not"),
+    "text for a number": (flat(force_n=["1", "2 N"] * 10), {}, r"row 2 \(a/1\): force_n is '2 N': give a finite"),
     "not UTF-8": (flat(force_n=np.array([b"\xff"] * 20)), {}, "force_n is not UTF-8 text in a"),
-    "a whole vector": (
-        flat(),
-        {"values": "pose:mm"},
-        r"pose is float64 \[20, 3\] in a: .*of lists one is named, pose\[0\]",
-    ),
+    "a whole vector": (flat(), {"values": "pose:mm"}, r"pose is float64 \[20, 3\] in a: .*of lists one is named"),
     "past the vector": (flat(), {"values": "pose[3]:mm"}, r"pose\[3\] does not exist: pose has 3 numbers"),
 }
 
@@ -395,9 +379,7 @@ TRAPS: dict[str, tuple[Callable[[h5py.File], None], str]] = {
 
 
 @pytest.mark.parametrize("name", TRAPS)
-def test_files_that_show_others_or_fill_the_memory(
-    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_files_that_show_others_or_fill_memory(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     path = write(tmp_path / "a.h5", flat())
     with h5py.File(path, "a") as file:
         TRAPS[name][0](file)
@@ -434,9 +416,7 @@ ZARR: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("name", ZARR)
-def test_what_zarr_says_of_itself_is_not_believed(
-    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_zarr_says_is_not_believed(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "a.zarr"
     buffer = zarr.open_group(path, mode="w", zarr_format=2)
     content = {"data/camera": grays(*range(20)), "data/gel": grays(*range(20)), ENDS: np.array([8, 20])}

@@ -154,9 +154,7 @@ def test_damaged_grasps_are_listed_and_the_rest_is_read(tmp_path: Path) -> None:
     damaged[chunk.byte_offset + 2 : chunk.byte_offset + chunk.size] = b"\xff" * (chunk.size - 2)
     path.write_bytes(damaged)
     source = CalandraConfig(path=tmp_path, size=24).source()
-    with pytest.raises(
-        ValueError, match=r"6 of 10 items cannot be read, first calandra_corl2017_000.h5 i1: .*object_name"
-    ):
+    with pytest.raises(ValueError, match=r"6 of 10 items cannot be read, first .*_000\.h5 i1: .*object_name"):
         build(source, tmp_path / "strict", size=24, quiet=True)
     pack = build(source, tmp_path / "lenient", size=24, max_damaged=0.6, quiet=True)
     assert pack.num == 3 * 4

@@ -85,17 +85,14 @@ def test_nothing_is_extrapolated_and_what_is_left_out_is_counted(tmp_path: Path)
         r"force\.csv joined by stamp, its largest gap is 0\.21 s; (\d+) of 150 rows are not .*", note
     ) and f"; {150 - pack.num} of" in note  # fmt: skip
     wide = packed(root, tmp_path / "w", **LOG, tolerance=0.2)
-    inside = (wide.column("time").astype(float) > 0.893) & (wide.column("time").astype(float) < 1.093)
-    assert inside.sum() == 15 and np.allclose(
-        wide.values(wide.spec.values[0])[:, 0], force(wide.column("time").astype(float)), atol=1e-6
-    )
+    time = wide.column("time").astype(float)
+    assert ((time > 0.893) & (time < 1.093)).sum() == 15
+    assert np.allclose(wide.values(wide.spec.values[0])[:, 0], force(time), atol=1e-6)
 
 
 def test_a_clock_that_is_off_is_named_and_set_right(tmp_path: Path) -> None:
     root = recorded(tmp_path / "set", shift=START)
-    with pytest.raises(
-        ValueError, match=r"force\.csv has no time of the images, 0\.000 to 1\.960 s, but 1699999999\.9"
-    ):
+    with pytest.raises(ValueError, match=r"force\.csv has no time of the images, 0\.000 to 1\.960 s, but 16999"):
         packed(root, tmp_path / "no", **LOG)
     pack = packed(root, tmp_path / "p", **{**LOG, "log": (f"force.csv:stamp-{START:.0f}",)})
     assert np.allclose(pack.values(pack.spec.values[0])[:, 0], force(pack.column("time").astype(float)), atol=1e-4)
@@ -175,14 +172,8 @@ def own_times(name: str, *lines: object) -> Callable[[Path], None]:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (
-            lambda root: (root / "0/force.csv").rename(root / "force.csv"),
-            r"would be the log of 2 recordings at the same",
-        ),
-        (
-            spoil(stamp=lambda cell: str(round(1000 * float(cell)) + 97)),
-            r"stamps are 10 s apart, .*: are they seconds\?",
-        ),
+        (lambda root: (root / "0/force.csv").rename(root / "force.csv"), r"would be the log of 2 recordings"),
+        (spoil(stamp=lambda cell: str(round(1000 * float(cell)) + 97)), r"stamps are 10 s apart, .*: are they seconds"),
         (spoil(36, Fz=lambda _: "1 N"), r"row 36: Fz is '1 N', which cannot be interpolated"),
         (spoil(36, stamp=lambda _: "then"), r"force\.csv, column stamp: 'then' is no time: give seconds"),
         (own_times("txt", *range(30), 20, *range(31, 50)), r"gel_timestamps\.txt: time 31 is before the one above it"),
@@ -265,10 +256,9 @@ def test_videos_without_labels_are_data(tmp_path: Path) -> None:
 
 
 def test_images_without_labels_are_one_recording(tmp_path: Path) -> None:
+    (tmp_path / "digit").mkdir()
     for i in range(20):
-        Image.new("RGB", (16, 16), (10 * i, 0, 0)).save(
-            (tmp_path / "digit").mkdir(exist_ok=True) or tmp_path / f"digit/frame_{i}.png"
-        )
+        Image.new("RGB", (16, 16), (10 * i, 0, 0)).save(tmp_path / f"digit/frame_{i}.png")
     pack = packed(tmp_path / "digit", tmp_path / "p")
     assert pack.images["touch"][:, 0, 0, 0].tolist() == [10 * i for i in range(20)]  # 2 before 10
     assert pack.column("split").tolist() == ["train"] * 18 + ["val"] * 2 and "time" not in pack.table.column_names

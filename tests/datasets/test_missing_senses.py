@@ -1,6 +1,6 @@
 """Rows that lack a modality: stored and marked, never trained on as a pair, never probed on what they lack."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,19 +23,7 @@ from mvitac.recipes import recipe
 from mvitac.training.loop import train
 from mvitac.training.sampler import partners
 from mvitac.training.views import StepViews
-from support.toy import Toy
-
-
-@dataclass
-class Holes(Toy):
-    """Every fifth item without touch, every seventh without vision."""
-
-    def read(self, item: int) -> list[Sample]:
-        (sample,) = super().read(item)
-        has = {"vision": item % 7 != 3, "touch": item % 5 != 1}
-        columns = {**sample.columns, **{f"has_{m}": present for m, present in has.items()}}
-        images = {m: getattr(sample, m) if has[m] else None for m in has}
-        return [Sample(columns=columns, **images)]
+from support.toy import Holes, Toy
 
 
 @pytest.fixture(scope="module")

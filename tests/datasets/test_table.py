@@ -99,9 +99,7 @@ def test_every_video_is_decoded_once(films: Path, tmp_path: Path, monkeypatch: p
     packed(table(films / "once.csv", film_rows()), tmp_path / "q", labels=("label",), group="take")
     assert len(asked) == 3 * 8
     assert Pack(tmp_path / "q").digest == Pack(tmp_path / "p").digest
-    monkeypatch.setattr(
-        rows_module, "MAX_TOGETHER_BYTES", 4 * 16 * 16 * 6
-    )  # the same by bytes: four rows of two images
+    monkeypatch.setattr(rows_module, "MAX_TOGETHER_BYTES", 4 * 16 * 16 * 6)  # four rows of two images
     source = FolderConfig(path=films / "once.csv", size=16, labels=("label",), group="take").source()
     assert list(source.samples_per_item()) == [4, 4, 4] * 4
 
@@ -204,9 +202,8 @@ def test_a_row_may_lack_a_modality(tmp_path: Path) -> None:
     file = table(tmp_path / "m.csv", gappy(tmp_path))
     with pytest.raises(ValueError, match=r"row 2 .*has no vision path: .*allow-missing"):
         packed(file, tmp_path / "no", labels=("label",), group="object")
-    half = table(
-        tmp_path / "half.csv", [{**row, "left": ""} if i == 0 else row for i, row in enumerate(gappy(tmp_path))]
-    )
+    first, *others = gappy(tmp_path)
+    half = table(tmp_path / "half.csv", [{**first, "left": ""}, *others])
     with pytest.raises(ValueError, match=r"row 1 .*has no left path: stacked sensors need both images"):
         packed(half, tmp_path / "no", labels=("label",), group="object", allow_missing=True)
     pack = packed(file, tmp_path / "pack", labels=("label",), group="object", allow_missing=True)

@@ -328,9 +328,7 @@ def test_missing_recordings_are_named_and_may_be_left_out(tree: Path, tmp_path: 
     (root / "dataset" / NAMES[4] / "video.mp4").unlink()
     (root / "dataset" / NAMES[5] / "video.mp4").write_bytes(b"")
     (root / "dataset" / NAMES[6]).rename(root / "dataset" / f"{NAMES[6]}_rock")
-    with pytest.raises(
-        ValueError, match=r"3 of 8 listed recordings cannot be packed: 20220505_120000 \(no video\.mp4\)"
-    ) as told:
+    with pytest.raises(ValueError, match=r"3 of 8 listed recordings .*: 20220505_120000 \(no video\.mp4\)") as told:
         TouchAndGoConfig(root=root).source()
     assert f"{NAMES[5]} (no video.mp4), {NAMES[1]} (no folder)" in str(told.value)
     pack = packed(root, tmp_path / "pack", partial=True)
@@ -351,9 +349,7 @@ def test_a_damaged_stretch_is_left_out_and_listed(tree: Path, tmp_path: Path) ->
     whole = bytearray(path.read_bytes())
     whole[at : at + size] = bytes(size)
     path.write_bytes(whole)
-    with pytest.raises(
-        ValueError, match=rf"10 of 239 samples cannot be read, first {NAMES[2]}/0000000134: gelsight\.mp4"
-    ):
+    with pytest.raises(ValueError, match=rf"10 of 239 samples .*, first {NAMES[2]}/0000000134: gelsight\.mp4"):
         packed(root, tmp_path / "strict")
     pack = packed(root, tmp_path / "pack", max_damaged=0.05)
     gone = [f"{NAMES[2]}/{number:010d}" for number in range(134, 144)]  # to the next key frame

@@ -117,9 +117,7 @@ def test_the_heads_have_a_view_of_their_own_where_they_learned_from_one(smoke_ru
         torch.testing.assert_close(found[f"shared_{m}"], shared[m], atol=1e-3, rtol=1e-3)
         assert not torch.allclose(shared[m], model.project(m, features[m]), atol=1e-3)
     check(model, graph, pack)
-    graph.head_views["vision"].filter = graph.head_views["vision"].filter.flip(
-        0
-    )  # the parity check looks at the shared space too
+    graph.head_views["vision"].filter = graph.head_views["vision"].filter.flip(0)
     with pytest.raises(ValueError, match="shared_"):
         check(model, graph, pack)
 
@@ -218,9 +216,7 @@ def test_lost_accuracy_stops_an_export(model: Model, pack: Pack) -> None:
         parity(graph, worse, pack, rows, wanted, **EXACT)
 
 
-def test_an_engine_that_computes_otherwise_is_refused_on_the_spot(
-    value_onnx: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_engine_that_computes_otherwise_is_refused(value_onnx: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The few real inputs that travel are run again: features of twice the length have the same cosine, not the values."""
 
     def refused(call: Any, says: str) -> None:
@@ -292,9 +288,7 @@ def test_the_card_has_errors_in_the_unit(value_artifact: Path) -> None:
     assert "| mean |" in text and "| untrained |" in text
 
 
-def test_an_export_gives_the_models_values_with_unit_and_spread(
-    value_onnx: Path, value_artifact: Path, measured: Pack
-) -> None:
+def test_an_export_gives_values_with_unit_and_spread(value_onnx: Path, value_artifact: Path, measured: Pack) -> None:
     engine, model = Engine(value_onnx, threads=1), mvitac.load(value_artifact)
     images = {m: np.asarray(measured.images[m][:5]) for m in measured.images}
     found, said = engine(**images), model.predict(**images)
@@ -311,9 +305,7 @@ def test_an_export_gives_the_models_values_with_unit_and_spread(
     assert light["allowed"] == pytest.approx(0.1 * spread)
 
 
-def test_an_export_that_changes_a_value_is_refused_in_the_unit(
-    value_artifact: Path, measured: Pack, pack: Pack
-) -> None:
+def test_an_export_that_changes_a_value_is_refused(value_artifact: Path, measured: Pack, pack: Pack) -> None:
     model = mvitac.load(value_artifact)
     graph, rows = ExportModule(model), measured.rows("test")
     wanted = reference(model, graph, measured, rows)
@@ -325,7 +317,7 @@ def test_an_export_that_changes_a_value_is_refused_in_the_unit(
         return found
 
     with pytest.raises(
-        ValueError, match=f"changes weight by {0.2 * std:.3g} N .* at most {0.1 * std:.3g} is allowed .--value-loss"
+        ValueError, match=f"changes weight by {0.2 * std:.3g} N .* at most {0.1 * std:.3g} is .*--value-loss"
     ):
         parity(graph, call, measured, rows, wanted, min_cosine=0.99)
     report = parity(graph, call, measured, rows, wanted, min_cosine=0.99, value_loss=0.3)

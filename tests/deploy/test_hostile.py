@@ -186,10 +186,7 @@ ABOVE = put("files", "../trap/pairs.csv", value="0")
 ARTIFACTS: dict[str, tuple[dict[str, Any], str]] = {
     "a pickle": ({"files": {MODEL: pickle.dumps(Payload())}}, "cannot be read as safetensors"),
     "a huge header": ({"files": {MODEL: (1 << 40).to_bytes(8, "little") + b"{"}}, "cannot be read as safetensors"),
-    "size": (
-        {"stored": LARGE, "about": put("preprocessing", "stored", value=LARGE)},
-        "stored 1000000000: expected 1 to 1024 px",
-    ),
+    "size": ({"stored": LARGE, "about": put("preprocessing", "stored", value=LARGE)}, "stored 1000000000: expected"),
     "trunk from the Hub": ({"run": encoder(trunk="hf-hub:stranger/model")}, "unknown trunk"),
     "trunk from a folder": ({"run": encoder(trunk="local-dir:{trap}")}, "unknown trunk"),
     "a field that is none": ({"run": put("exec", value="rm")}, "unknown field in run 'exec'"),
@@ -229,9 +226,7 @@ def test_what_is_forged_is_refused(
         opened(folder)
 
 
-def test_a_network_larger_than_the_machine_is_refused_before_it_is_made(
-    copy: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_network_larger_than_the_machine_is_not_made(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A header of a few kilobytes may name one."""
     forge(copy, run=encoder(trunk="resnetv2_152x4_bit"))
     made, parameter = set(), torch.nn.Parameter.__new__

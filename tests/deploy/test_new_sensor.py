@@ -19,12 +19,7 @@ from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import Materials, MaterialsConfig
 from mvitac.deploy.engine import Engine, about_sensor
 from mvitac.deploy.publish import with_probes
-from mvitac.evaluation.sensors import (
-    RecolouredPack,
-    learn_looks,
-    touch_features,
-    unlabelled_rows,
-)
+from mvitac.evaluation.sensors import RecolouredPack, learn_looks, touch_features, unlabelled_rows
 from mvitac.live.cameras import Ended, Source
 from mvitac.live.contact import LiveConfig
 from mvitac.live.predictor import Live

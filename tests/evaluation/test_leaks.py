@@ -68,7 +68,7 @@ def test_scores_of_rows_that_were_trained_on_are_refused(
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_leak_stands_beside_every_score(
+def test_leak_is_beside_every_score(
     run: Path, turned: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """In the terminal, JSON, the report and the card; not beside controls, which learned nothing from those rows."""
@@ -96,9 +96,7 @@ def test_leak_stands_beside_every_score(
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_forgotten_group_is_told_below_every_score(
-    pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_forgotten_group_is_told_below_scores(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """By ``data check``, ``probe``, in the report and on the card."""
     rows = []
     for i, split in enumerate(pack.column("split")):

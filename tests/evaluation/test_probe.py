@@ -330,9 +330,7 @@ def test_few_values_keep_two_of_each_target(measured: Pack) -> None:
     assert len(np.unique(pack.values(task)[rows.train[train], 0])) > 1
 
 
-def test_the_command_shows_few_labels_beside_all(
-    smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_shows_few_labels(smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = ["--tasks", "pattern", "--modalities", "touch", "--json", str(tmp_path / "scores.json")]
     assert main(["probe", str(smoke_run), *asked, "--fractions", "10", "50"]) == 0
     said = capsys.readouterr().out

@@ -331,9 +331,7 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(
     assert [job.done for job in work.jobs] == [False, True]
 
 
-def test_what_another_process_is_at_is_left_to_it(
-    pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_another_process_does_is_left(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """As when the same command runs on two machines; here a thread is the other one."""
     work = lay_out(small(pack, rows=ROWS[:2], seeds=1), pack, tmp_path, ProbeConfig(controls=False))
     begun, go = threading.Event(), threading.Event()
@@ -603,9 +601,7 @@ def test_folds_that_cannot_be(
     assert message in capsys.readouterr().err
 
 
-def test_folds_test_a_group_once_in_a_tasks_own_split(
-    two_folds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_groups_are_tested_once_in_own_splits(two_folds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = find_plan(str(two_folds))
     real = type(plan.data).open
 

@@ -161,9 +161,7 @@ def test_test_labels_decide_nothing(ancestor: Path, pack: Pack, tuned: Path, tmp
 
 @pytest.mark.usefixtures("often")
 @pytest.mark.parametrize("after", [4, 7])  # while settings are tried, and in the final run
-def test_killed_and_resumed_equals_straight(
-    ancestor: Path, pack: Pack, tuned: Path, tmp_path: Path, after: int
-) -> None:
+def test_killed_and_resumed_is_straight(ancestor: Path, pack: Pack, tuned: Path, tmp_path: Path, after: int) -> None:
     asked = replace(ASKED, from_scratch=False)
     with power_cut(after), pytest.raises(RuntimeError, match="power cut"):
         tune(ancestor, pack, tmp_path / "out", asked)

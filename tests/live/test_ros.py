@@ -84,9 +84,7 @@ class Robot:
 
 
 @pytest.mark.parametrize("always", [False, True])
-def test_it_answers_at_its_rate_under_the_time_of_the_images(
-    onnx: Path, monkeypatch: pytest.MonkeyPatch, always: bool
-) -> None:
+def test_it_answers_at_its_rate_under_image_times(onnx: Path, monkeypatch: pytest.MonkeyPatch, always: bool) -> None:
     robot = Robot(monkeypatch, export=str(onnx), vision=VISION, touch=TOUCH, rate=50.0, always=always)
     load_node().main()
     robot.rclpy.try_shutdown.assert_called_once()

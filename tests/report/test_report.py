@@ -264,9 +264,7 @@ def test_report_and_comparison_give_one_text_for_one_score(materials: Path, resu
         assert re.search(rf"[> ]{re.escape(text.split()[0])}<", drawn), cell  # beside a bar or a line
 
 
-def test_probe_and_card_give_one_text_for_one_score(
-    materials: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_probe_and_card_give_one_text(materials: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run, card = materials / "run0", tmp_path / "card"
     assert main(["probe", str(run), "--json", str(tmp_path / "probe.json")]) == 0
     printed = capsys.readouterr().out

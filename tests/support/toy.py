@@ -122,3 +122,15 @@ def renumbered(pack: Pack, *classes: str) -> Pack:
 
 def toy_pack(path: Path, size: int = 32, **kwargs: Any) -> Pack:
     return build(Toy(**kwargs), path, size=size, quiet=True)
+
+
+@dataclass
+class Holes(Toy):
+    """Every fifth item without touch, every seventh without vision."""
+
+    def read(self, item: int) -> list[Sample]:
+        (sample,) = super().read(item)
+        has = {"vision": item % 7 != 3, "touch": item % 5 != 1}
+        columns = {**sample.columns, **{f"has_{m}": present for m, present in has.items()}}
+        images = {m: getattr(sample, m) if has[m] else None for m in has}
+        return [Sample(columns=columns, **images)]

@@ -142,9 +142,8 @@ def test_other_weights_are_refused_at_resume(pack: Pack, smoke_run: Path, tmp_pa
     source = shutil.copytree(smoke_run, tmp_path / "source")
     run = smoke(pack, init=Init(path=source), steps=1, eval_every=0)
     out = train(run, tmp_path / "r", quiet=True)
-    shutil.copy(
-        train(smoke(pack, seed=9, steps=1, eval_every=0), tmp_path / "x", quiet=True) / "model.safetensors", source
-    )
+    other = train(smoke(pack, seed=9, steps=1, eval_every=0), tmp_path / "x", quiet=True)
+    shutil.copy(other / "model.safetensors", source)
     with pytest.raises(ValueError, match="holds a different run"):
         train(run, out, resume=True, quiet=True)
     with pytest.raises(ValueError, match=r"source now holds other weights than this run was recorded with"):
@@ -224,10 +223,7 @@ def test_mistakes_are_one_line(pack: Pack, smoke_run: Path, tmp_path: Path, caps
         (["--init", str(tmp_path / "unfinished")], "its run is not finished, continue it with --resume"),
         (["--encoder.weights", str(tmp_path / "nan.safetensors")], "nan.safetensors holds NaN or infinite numbers: "),
         (["--init", str(tmp_path / "nan.safetensors")], "nan.safetensors was not written by mvitac"),
-        (
-            [f"--init={smoke_run}", "--encoder.trunk", "resnet10t"],
-            "does not fit this run (vision: its trunk is mvitac_tiny",
-        ),
+        ([f"--init={smoke_run}", "--encoder.trunk", "resnet10t"], "does not fit this run (vision: its trunk is"),
     ]
     for words, expected in cases:
         assert main([*data, *words, "--out", str(tmp_path / "out")]) == 2, words

@@ -151,9 +151,7 @@ def test_a_value_far_from_zero_has_the_same_r2(measured: Pack) -> None:
     assert scores[0] == pytest.approx(scores[1], abs=1e-4)
 
 
-def test_probe_scores_the_best_weights(
-    pack: Pack, run: Path, smoke_run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_probe_scores_best_weights(pack: Pack, run: Path, smoke_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = ["--weights", "best", "--tasks", "pattern", "--modalities", "touch", "--no-controls"]
     assert main(["probe", str(run), *asked]) == 0
     assert "mvitac, best" in capsys.readouterr().out and not (run / "probe.json").exists()

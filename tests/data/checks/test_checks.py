@@ -164,11 +164,7 @@ FAULTS = {
     "copies": ("identical images across splits", "broken", "vision: 5 of 320"),
     "near-copies": ("near-copies across splits", "look", "vision: 16 of"),
     "leak": ("groups across splits", "broken", "e.g. 'object 0'; 1 of 5 in test are also in train"),
-    "spelling": (
-        "names that differ in spelling only",
-        "look",
-        r"group: 'OBJECT\xa003' and 'object 3'",
-    ),
+    "spelling": ("names that differ in spelling only", "look", r"group: 'OBJECT\xa003' and 'object 3'"),
     "labels": ("labels of material", "look", "first 00-01"),
     "sensor": ("columns that give a label away", "look", "sensor predicts material with 100 % accuracy"),
     "give-away": ("columns that give a label away", "look", "force predicts material with 91 % accuracy"),

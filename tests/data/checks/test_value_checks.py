@@ -87,9 +87,7 @@ def test_healthy_values(healthy: Pack) -> None:
         ("outside", "values of force", "test rows are outside train (0.1", []),
     ],
 )
-def test_each_fault_of_values_is_found_and_no_other(
-    tmp_path: Path, fault: str, item: str, says: str, rows: list[int]
-) -> None:
+def test_each_fault_is_found_and_no_other(tmp_path: Path, fault: str, item: str, says: str, rows: list[int]) -> None:
     pack = packed(tmp_path / "pack", fault)
     found = {finding.item: finding for finding in value_checks.values(pack)}
     assert found[item].verdict == "look" and says in found[item].evidence, found[item]
