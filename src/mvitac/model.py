@@ -257,9 +257,7 @@ class Model(nn.Module):
     def _check_background(self, modality: str, background: ImageInput | None) -> None:
         first = self.spec.window.minus_first and "touch" in self.spec.window.of
         if background is not None and (modality != "touch" or self.spec.difference == first):
-            raise ValueError(
-                "background cannot be used: only touch minus a background, or minus its first frame, has one"
-            )
+            raise ValueError("background cannot be used: only touch minus a background or its first frame has one")
 
     def predict(
         self, *, vision: ImageInput | None = None, touch: ImageInput | None = None, background: ImageInput | None = None

@@ -111,7 +111,7 @@ def test_other_windows_are_other_data_and_single_frames_are_the_pack_itself(pres
     ("options", "message"),
     [
         ({"frames": 3, "stride": 4.0}, "longer than every touch"),
-        ({"frames": 3, "stride": 0.5}, "shown twice"),
+        ({"frames": 3, "stride": 0.5}, "give more, or another"),
         ({"frames": 2, "order": "split"}, "not a number in row 0"),
         ({"frames": 2, "order": "label_late"}, "two rows of touch"),
     ],

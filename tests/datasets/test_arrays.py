@@ -128,10 +128,8 @@ def test_a_group_is_a_demonstration(tmp_path: Path) -> None:
     assert pack.column("robot").tolist() == ["hand" if k == 2 else "arm" for k in number]
     assert set(pack.column("weight")) == {"0", "0.5", "1", "1.5"} and set(pack.column("total")) == {"18"}
     assert pack.column("id")[0] == "data/demo_0/0" and "env_args" not in pack.table.column_names
-    touched = packed(
-        FolderConfig(path=tmp_path / "demos.hdf5", touch_group="demo", group="object", **DEMOS), tmp_path / "t"
-    )
-    assert set(touched.column("touch_group")) == {f"data/demo_{k}" for k in range(4)}
+    touched = packed(FolderConfig(path=tmp_path / "demos.hdf5", group="object", **DEMOS), tmp_path / "t")
+    assert set(touched.column("touch_group")) == {f"cup{k % 2}/data/demo_{k}" for k in range(4)}
 
 
 def test_a_folder_of_files(tmp_path: Path) -> None:
@@ -318,6 +316,7 @@ def test_a_crop_is_cut_out_of_images_and_backgrounds(tmp_path: Path) -> None:
     pack = packed(FolderConfig(**options, crop=crops), tmp_path / "p")
     assert (pack.images["touch"][..., 0] == 10 * np.arange(12)[:, None, None]).all()
     assert (pack.images["touch"][..., 3] == 100 + 10 * np.arange(12)[:, None, None]).all()
+    assert pack.spec.crop == {"touch": "0:4:20:16, 20:4:20:16"}
     assert pack.spec.notes[0] == "left=0:4:20:16 is the part of the images that is used, squeezed to a square"
     flat = packed(FolderConfig(**options, crop=crops, difference=True, background=("a", "b")), tmp_path / "d")
     assert (flat.images["touch"] == 128 + 5 * np.arange(12)[:, None, None, None]).all()

@@ -173,7 +173,7 @@ def test_folds_test_every_group_once_that_no_run_learned_from(pack: Pack, runs: 
         for split, each in zip(splits, tested, strict=True):
             assert not each & set(groups[split == "train"]) and len(each | set(groups[split == "train"])) == 60
             assert min(np.bincount(pack.labels(task.name)[split == "test"], minlength=3)) > 0
-    with pytest.raises(ValueError, match=r"task 'pattern' has 60 instances .* give --folds 2 to 60"):
+    with pytest.raises(ValueError, match=r"task 'pattern' has 60 instances .* too few for 61 folds"):
         fold_splits(pack, task, 61, [])
     before = (runs[0] / "probe.json").exists()
     found = probe_runs(runs, ProbeConfig(folds=3, tasks=("pattern", "bright"), modalities=("touch",)))

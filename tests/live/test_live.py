@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mvitac.cli.live import _engine, sources
+from mvitac.cli.live import _engine, _say_uncropped, sources
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.deploy.engine import Engine
@@ -207,6 +207,13 @@ def test_what_is_simulated_is_asked_for() -> None:
             sources(pair, *given)
     with pytest.raises(ValueError, match="no input for vision: leave --vision out"):
         sources(gripper, "0", ("2", "4"))
+
+
+def test_a_source_that_is_used_whole_is_named(engine: Engine, capsys: pytest.CaptureFixture[str]) -> None:
+    """Where the model's data showed a part: else it predicts from what it never saw."""
+    for text, warns in (("0", True), ("0#4:0:9:9", False), ("sim:1", False)):
+        _say_uncropped(Other(engine, crop={"touch": "4:0:9:9"}), {"touch": (text,)})
+        assert ("the model learned from 4:0:9:9: add" in capsys.readouterr().err) == warns
 
 
 def test_sources_by_name(tmp_path: Path) -> None:

@@ -155,7 +155,7 @@ def test_predict_command(
         ("--vision", "0", *both[2:]): "give a video",
     }
     for words, says in wrong.items():
-        assert main([*command, *words]) == 2
+        assert main([*command, *words, "--out", str(out)]) == 2
         assert says in capsys.readouterr().err
 
 

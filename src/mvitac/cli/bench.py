@@ -61,9 +61,8 @@ _MANUAL = """Score an encoder on every task of a suite, beside the same controls
 
 def bench(argv: list[str]) -> None:
     """mvitac bench MODEL... --suite NAME [--out DIR] [--data-root DIR]"""
-    options = parse(
-        _Options, argv, "bench", description=_MANUAL.format(suites=", ".join([*shipped(), *loop.shipped()]))
-    )
+    suites = ", ".join([*shipped(), *loop.shipped()])
+    options = parse(_Options, argv, "bench", description=_MANUAL.format(suites=suites))
     if not options.models:
         raise ValueError("name the encoder: the folder of a run or an artifact (see mvitac bench --help)")
     if options.suite in loop.shipped():

@@ -1,5 +1,6 @@
 """``mvitac data check``: what is wrong with a dataset."""
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -53,6 +54,8 @@ class _SourceOptions(_Options):
 def check(argv: list[str]) -> int:
     """mvitac data check PACK [PACK ...] | --data NAME ... [--json FILE] [--sheet FILE.png]"""
     chosen, rest = selectors(argv, ("--data",))
+    if "--data" not in chosen and rest and (path := Path(rest[0])).exists() and not (path / "pack.json").exists():
+        chosen["--data"] = rest.pop(0)  # a table, a video or a folder
     if "--data" not in chosen:
         options = parse(_PackOptions, rest, "data check", description=_MANUAL)
         name = " + ".join(options.pack)
@@ -89,8 +92,9 @@ def _sheet(what: str, options: _Options) -> Draw | None:
 
 def _report(what: str, findings: Sequence[Finding], options: _Options) -> int:
     code = exit_code(findings)
+    width = max(40, shutil.get_terminal_size().columns - 40)
     rows = [[f.verdict, f.item, f.evidence + (f"\n-> {f.advice}" if f.advice else "")] for f in findings]
-    table = tabulate(rows, ["", "item", "what was found"], disable_numparse=True, maxcolwidths=[None, 20, 80])
+    table = tabulate(rows, ["", "item", "what was found"], disable_numparse=True, maxcolwidths=[None, 20, width])
     say = printed_to(options.json)
     print(f"{what}: {('ok', 'look', 'broken')[code]}", table, "", sep="\n", file=say)
     save_json(options.json, {"what": what, "exit_code": code, "findings": [asdict(f) for f in findings]})

@@ -35,7 +35,7 @@ from mvitac.system.progress import shown, work
 
 @dataclass(frozen=True, kw_only=True)
 class _Common:
-    model: Positional[str]
+    model: Annotated[Positional[str], tyro.conf.arg(metavar="MODEL")]
     """Folder of an export (fastest); or of a run or an artifact, or owner/name on the Hub, which is exported first."""
     vision: str | None = None
     """SOURCE of the camera. Of other data than recordings: the name of its images."""
@@ -104,6 +104,7 @@ def live(argv: list[str]) -> None:
 def _streams(options: _Options, engine: Engine) -> dict[str, list[Stream]]:
     """The streams by modality, not yet open; several of one modality are numbered from 1."""
     given = sources(frame_shapes(engine), options.vision, options.touch)
+    _say_uncropped(engine, given)
     return {
         m: [
             Stream(m if len(texts) == 1 else f"{m} {i}", source(text, m), stale_after=options.stale)
@@ -147,9 +148,9 @@ class _PredictOptions(_Common):
     #x:y:width:height after it is the part that is used, where the data was packed with --crop.
     """
 
-    source: Positional[str | None] = None
+    source: Annotated[Positional[str | None], tyro.conf.arg(metavar="SOURCE")] = None
     """SOURCE, where the model takes one input; or other data: a pack, a table, a bag, whatever --data reads."""
-    out: Path = Path("predictions.csv")
+    out: Path
     """The table, a row for each frame."""
 
 
@@ -171,6 +172,7 @@ def predict(argv: list[str]) -> None:
         _write(options.out, pack_tables(engine, pack), pack.num)
         return
     opened = dict.fromkeys(engine.inputs, single) if single else opened
+    _say_uncropped(engine, dict.fromkeys(engine.inputs, (options.source,)) if single else given)
     recordings = Recordings(engine, opened, options.live, options.free())
     _write(options.out, recordings.tables(), recordings.num)
     if num := recordings.left_out:
@@ -261,6 +263,15 @@ def _engine(model: str, threads: int, modalities: tuple[Any, ...] = (), *, most:
         with shown():
             export(with_probes(loaded, pack), pack, folder, ExportConfig(modalities=modalities))
     return Engine(folder, threads=threads)
+
+
+def _say_uncropped(engine: Engine, given: Mapping[str, Sequence[str | None]]) -> None:
+    """Warn of sources that are used whole, although the model's data showed a part."""
+    for m, part in engine.crop.items():
+        if any("#" not in f"{text}" and not f"{text}".startswith("sim") for text in given.get(m, ())):
+            _say(
+                f"mvitac: warning: {m} is used whole, the model learned from {part}: add that to SOURCE, #x:y:width:height"
+            )
 
 
 def _say(text: str) -> None:

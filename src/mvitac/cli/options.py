@@ -9,6 +9,7 @@ import json
 import os
 import re
 import sys
+import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
@@ -44,12 +45,16 @@ def parse(
         with contextlib.redirect_stderr(boxed):
             if {"-h", "--help"} & set(argv):
                 # A flag is shown in the one form that changes something; --x and --no-x are both accepted.
-                with _joined_lines():
-                    return tyro.cli(kind, **options, config=(tyro.conf.FlagCreatePairsOff, tyro.conf.SuppressFixed))  # type: ignore[arg-type]
+                with _joined_lines(), contextlib.redirect_stdout(io.StringIO()) as shown:
+                    tyro.cli(kind, **options, config=(tyro.conf.FlagCreatePairsOff, tyro.conf.SuppressFixed))  # type: ignore[arg-type]
             with _columns("10000"):  # the lines of an error must not be wrapped
                 return tyro.cli(kind, **options)  # type: ignore[arg-type]
     except SystemExit as exit_:
-        if not exit_.code:
+        if not exit_.code:  # what has no default, or may be left out, need not be said
+            text = re.sub(r"\{None\}\|(\S+ )( +\S)", r"\1       \2", shown.getvalue())
+            text = re.sub(r"\{None\}\||\s+\(default:\s+(None)?\)", "", text)
+            for line in text.split("\n")[:-1]:  # but for a list of choices, which ``_check_choices`` reads
+                print(line if line[:1] == " " else textwrap.fill(line, 80))
             raise
         raise ValueError(_one_line(boxed.getvalue(), prog)) from None
 

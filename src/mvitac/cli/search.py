@@ -52,9 +52,8 @@ def embed(argv: list[str]) -> None:
     pack = as_trained(model, Pack(options.pack))
     with shown():
         table = embed(model, pack, options.out, shared=options.shared)
-    print(
-        f"{options.out}: {table.num_rows} rows of {' and '.join(m for m in model.encoders if m in table.column_names)}"
-    )
+    seen = " and ".join(m for m in model.encoders if m in table.column_names)
+    print(f"{options.out}: {table.num_rows} rows of {seen}")
     if new := about_new(model, pack):
         print(new)
 
@@ -122,9 +121,7 @@ def find(argv: list[str]) -> None:
             raise ValueError(f"{pack.path} is another pack than the one that was embedded: embed it again")
         tiles = [(pack.images[target][one["row"]], f"{one['cosine']:.3f} {one['id']}") for one in found]
         blocks = [("query", [(query, "")]), ("found", tiles)]
-        sheet = draw(
-            title, [(name, [(side_by_side(fit(x, _SIDE)), text) for x, text in some]) for name, some in blocks]
-        )
+        sheet = draw(title, [(name, [(side_by_side(fit(x, _SIDE)), t) for x, t in some]) for name, some in blocks])
         write_atomic(options.sheet, lambda file: sheet.save(file, "PNG"))
 
 

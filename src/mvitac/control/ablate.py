@@ -84,9 +84,7 @@ def read_episodes(pack: Pack) -> Episodes:
     """The episodes of ``pack``, its groups; ValueError if it has no task of values "action", no touch or one episode."""
     values = {task.name: pack.values(task) for task in pack.spec.values}
     if "action" not in values or "touch" not in pack.spec.modalities:
-        raise ValueError(
-            f"{pack.path} has no touch, or no values named action: pack it with --values action=a:mm,b:deg"
-        )
+        raise ValueError(f"{pack.path} has no touch, or no values named action: pack with --values action=a:mm,b:deg")
     for sense in pack.spec.modalities:
         if not (there := pack.has(sense)).all():  # it would be black, which no policy can use
             raise ValueError(f"{pack.path}: {(~there).sum()} rows have no {sense}: pack them without --allow-missing")

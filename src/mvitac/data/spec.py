@@ -109,6 +109,8 @@ class DataSpec:
     """Notes to print with every result, e.g. what train and test of a published split share."""
     difference: bool = False
     """Whether touch is stored as (touch - background) / 2 + 128."""
+    crop: dict[str, str] = field(default_factory=dict)
+    """Modality -> part of its images that is stored, as x:y:width:height of each sensor; without a name, all of them."""
     values: tuple[ValueTask, ...] = ()
     """Tasks whose answer is a number with a unit."""
     window: Window = Window()

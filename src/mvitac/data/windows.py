@@ -87,16 +87,17 @@ def frames_of(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray, np.nd
         times = place[rows]
         if (same := np.diff(times) == 0).any():
             at = times[int(np.flatnonzero(same)[0])]
-            raise ValueError(f"two rows of touch {_touch(pack, rows)!r} have {name} {at:g}: name another --data.order")
+            two = f"two rows of touch {_touch(pack, rows)!r} have {name} {at:g}"
+            raise ValueError(f"{two}: pack with --touch-group RECORDING, or name another --data.order")
         if window.frames > 1 and len(times) > 2 and (step := np.median(np.diff(times))) > 1.25 * window.stride:
             far = f"the distance of frames in touch {_touch(pack, rows)!r}, {step:g} (column {name})"
-            raise ValueError(f"stride {window.stride:g} is shorter than {far}: a frame would be shown twice")
+            raise ValueError(f"stride {window.stride:g} is shorter than {far}: give more, or another --data.order")
         asked = times[:, None] - back  # the newest frame that is old enough, else the first
         index[rows] = rows[np.maximum(np.searchsorted(times, asked + 1e-9, side="right") - 1, 0)]
         whole[rows] = asked[:, -1] >= times[0] - 1e-9
         first[rows] = rows[0]
     if not whole.any():
-        raise ValueError(f"frames {window.frames} at stride {window.stride:g} are longer than every touch: give fewer")
+        raise ValueError(f"frames {window.frames} at stride {window.stride:g} are longer than every touch")
     return index, whole, first
 
 

@@ -83,9 +83,7 @@ class RosbagConfig(RecordedConfig):
                 rows.append(recording_row(name.removesuffix(".bag"), i * every, float(own[i])) | cells[i])
                 for topic in cameras:
                     images[topic].append(Message(str(bag), topic, *at[topic][i]))
-        note = (
-            f"topics are joined by time within {self.tolerance:g} s; {dropped} images without all others are left out"
-        )
+        note = f"topics are joined by time within {self.tolerance:g} s; {dropped} images without all others left out"
         return Manifest.of(self.path, rows, images, notes=(note,))
 
 
@@ -94,9 +92,7 @@ def _bags(path: Path) -> list[Path]:
     if not found and path.is_dir():
         found = sorted([*(file.parent for file in path.rglob("metadata.yaml")), *path.rglob("*.bag")])
     if not found:
-        raise ValueError(
-            f"{path} is no bag and holds none: give a folder with metadata.yaml, a .bag, or a folder of them"
-        )
+        raise ValueError(f"{path} is no bag and holds none: give a folder with metadata.yaml, a .bag, or several")
     return found
 
 
@@ -122,9 +118,7 @@ def _read(bag: Path, cameras: Sequence[str], asked: Sequence[str]) -> dict[str, 
         topics = {connection.topic: connection.msgtype for connection in reader.connections}
         if not cameras:
             shown = [topic for topic, kind in topics.items() if kind.endswith("Image")]
-            raise ValueError(
-                f"{bag} has the image topics {', '.join(shown) or 'none'}: --data.vision or --data.touch TOPIC"
-            )
+            raise ValueError(f"{bag} has image topics {', '.join(shown) or 'none'}: --data.vision, --data.touch TOPIC")
         for topic in cameras:
             if topic not in topics:
                 raise ValueError(f"{bag}: {unknown('topic', topic, topics)}")

@@ -96,6 +96,7 @@ def preprocessing(model: Model) -> dict[str, Any]:
         "std": {m: list(model.run.encoder[m].levels[1]) for m in model.encoders},
         "difference": model.spec.difference,
         "background": SUBTRACTED if model.spec.difference else AS_GIVEN,
+        "crop": model.spec.crop,
         "sensors": list(model.spec.sensors),
         **({"window": {**to_json(model.spec.window), "layout": LAYOUT}} if model.spec.window.active else {}),
     }

@@ -25,7 +25,7 @@ from mvitac.registry import from_json
 from mvitac.system.files import brief, fields_of
 
 MODEL, CHECK = "model.onnx", "check.safetensors"
-EXPORT = SealedFolder("export.json", "mvitac-export", 2, "mvitac export", frozenset((MODEL, CHECK)))
+EXPORT = SealedFolder("export.json", "mvitac-export", 3, "mvitac export", frozenset((MODEL, CHECK)))
 Runtime = Literal["auto", "onnxruntime", "openvino"]
 Call = Callable[[list[np.ndarray]], list[np.ndarray]]
 
@@ -77,6 +77,8 @@ class Engine:
         """Whether the touch input is (touch - background) / 2 + 128."""
         self.window: dict[str, Any] | None = self.meta["preprocessing"].get("window")
         """For windows: number of frames, stride, its unit (order) and modalities (of), as in export.json."""
+        self.crop: dict[str, str] = self.meta["preprocessing"]["crop"]
+        """Modality -> part of the images that the model's data showed, as x:y:width:height."""
         self.sensors: list[str] = self.meta["preprocessing"]["sensors"]
         """Names of the touch sensors that the model met, as far as its file says."""
         self.new_sensor: dict[str, Any] | None = self.meta["preprocessing"].get("new_sensor")
@@ -84,6 +86,7 @@ class Engine:
         from_json(dict[str, tuple[str, ...]], self.classes, "classes")
         from_json(dict[str, tuple[_Target, ...]], self.values, "values")
         from_json(tuple[str, ...], self.sensors, "sensors")
+        from_json(dict[str, str], self.crop, "crop")
         self._call = open_model(self.folder / MODEL, engine, self.meta["precision"], threads)
 
     def _check(self) -> None:

@@ -96,9 +96,7 @@ class ExportModule(nn.Module):
         slopes = levels - levels.mean((1, 2), keepdim=True) - self.lamps
         # A difference, because int8 exports round what is added.
         shown = [slopes @ mixing - ground for mixing, ground in zip(self.mixing, self.minus_ground, strict=True)]
-        found = self.encoders[modality](
-            view(torch.cat(shown).round().clamp(0, 255))
-        )  # whole grey levels [L B, S, S, 3]
+        found = self.encoders[modality](view(torch.cat(shown).round().clamp(0, 255)))  # whole levels [L B, S, S, 3]
         return found.reshape(len(self.mixing), -1, found.shape[1]).mean(0)
 
     def forward(self, *images: Tensor) -> tuple[Tensor, ...]:

@@ -189,6 +189,8 @@ def as_trained(model: Model, pack: Pack) -> Pack:
 
 
 def _common_pack(models: Sequence[Model], pack: Pack | None) -> Pack:
+    if len({model.spec.window for model in models}) > 1:
+        raise ValueError("these runs see different windows of frames: probe them one by one, or `mvitac compare` them")
     if pack:
         return as_trained(models[0], pack) if models else pack
     packs = [model.open_data() for model in models]

@@ -26,7 +26,7 @@ def fold_splits(pack: Pack, task: AnyTask, num: int, learned: Sequence[Source]) 
     groups = pack.column("group")[rows].astype(str)
     if (left := len(set(groups))) < num:
         by = pack.spec.group_by
-        raise ValueError(f"task {task.name!r} has {left} {by}s that no run learned from: give --folds 2 to {left}")
+        raise ValueError(f"task {task.name!r} has {left} {by}s that no run learned from, too few for {num} folds")
     if isinstance(task, ValueTask):
         first = np.nan_to_num(pack.values(task)[rows, 0])
         strata = np.searchsorted(np.quantile(first, [0.25, 0.5, 0.75]), first)

@@ -9,6 +9,7 @@ from mvitac.datasets.pack import PackConfig
 from mvitac.model import Model
 from mvitac.registry import to_json
 from mvitac.run import load_run
+from mvitac.shipped import BASE
 from mvitac.system.files import digest
 
 
@@ -18,7 +19,8 @@ def names_of(paths: Sequence[Path], models: Sequence[Model]) -> list[str]:
     ValueError if two runs are the same, since they would count as two seeds.
     """
     several = len({model.run.recipe for model in models}) > 1
-    names = [f"{m.run.method.name} ({m.run.recipe})" if several else m.run.method.name for m in models]
+    own = [m.run.method.name + f" ({m.run.recipe})" * several for m in models]
+    names = ["base" if path == BASE else name for name, path in zip(own, paths, strict=True)]
     alike: dict[str, dict[str, dict[int, Path]]] = {}  # name -> settings -> seed -> folder
     for name, path, model in zip(names, paths, models, strict=True):
         seeds = alike.setdefault(name, {}).setdefault(_settings(path, model), {})

@@ -26,9 +26,7 @@ class Recorder:
     Recording ends when pairs cannot be written (a full disk); ``tell`` gets a sentence, and prediction goes on.
     """
 
-    def __init__(
-        self, out: Path, *, fps: float = 10.0, sensor: str = "", tell: Callable[[str], object] = print
-    ) -> None:
+    def __init__(self, out: Path, *, fps: float = 10, sensor: str = "", tell: Callable[[str], object] = print) -> None:
         """Record into the new folder ``out``; ``sensor`` is the touch sensor's name, if it is known (column sensor)."""
         if out.exists():
             raise ValueError(f"{out} already exists: choose another --record, or delete it first")

@@ -56,12 +56,9 @@ def pack_tables(engine: Engine, pack: Pack) -> Iterator[Table]:
     rows = np.flatnonzero(np.logical_and.reduce([pack.has(m) for m in engine.inputs]))
     known = [name for name in ("time", "contact", "id", "group", "split") if name in pack.table.column_names]
     chunks = np.split(rows, range(BATCH, len(rows), BATCH))
-    for chunk, images in prefetch((chunk, {m: pack.images[m][chunk] for m in engine.inputs}) for chunk in chunks):
-        yield {
-            "frame": chunk,
-            **{name: pack.column(name)[chunk] for name in known},
-            **answers(engine, engine(**images)),
-        }
+    for some, images in prefetch((some, {m: pack.images[m][some] for m in engine.inputs}) for some in chunks):
+        told = {name: pack.column(name)[some] for name in known}
+        yield {"frame": some, **told, **answers(engine, engine(**images))}
 
 
 class Recordings:

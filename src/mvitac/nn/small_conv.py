@@ -20,10 +20,7 @@ from timm.layers.padding import pad_same
 from torch import Tensor, nn
 
 MAX_PIXELS = 9  # of the output map, up to which products are faster than the convolution
-MAX_PIXELS_DEPTHWISE = {
-    3: 4,
-    5: 64,
-}  # the same for the weight gradient of a depthwise convolution, by its kernel's side
+MAX_PIXELS_DEPTHWISE = {3: 4, 5: 64}  # the same for the weight gradient of a depthwise convolution, by kernel side
 
 
 class SmallMapConv2d(nn.Conv2d):

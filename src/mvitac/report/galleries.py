@@ -48,11 +48,7 @@ def mistakes(study: Study) -> list[Markup]:
     return [html.paragraph(intro[0].upper() + intro[1:]), html.grid(halves, "queries")]
 
 
-_SHOWN = {
-    "": ("", ""),
-    "other": ("wrong", "\u2715 another class"),
-    "same class": ("same", "\u2248 same class"),
-}
+_SHOWN = {"": ("", ""), "other": ("wrong", "\u2715 another class"), "same class": ("same", "\u2248 same class")}
 
 
 def _strip(study: Study, modality: str, row: int, text: str, found: Sequence[tuple[int, str]]) -> Markup:

@@ -56,9 +56,7 @@ def probe(study: Study) -> list[Markup]:
             " is no better than their mean, and less is worse."
         )
     if {r["source"] for r in records} - set(study.sources):
-        intro += (
-            " Grey bars are controls: the same probe on frozen ImageNet and untrained trunks, pixels, and the border."
-        )
+        intro += " Grey bars are controls: the same probe on frozen ImageNet, untrained trunks, pixels and the border."
     return [html.paragraph(intro), html.grid(drawn), *numbers]
 
 
@@ -70,10 +68,7 @@ def _scores(study: Study, summary: dict[str, Any]) -> list[Markup]:
         rows, muted = [], set()
         for task, found in tasks.items():
             order = sources_of(found)
-            rows += [
-                [f"{task} ({tested_on(found, study.pack.spec.group_by)})"],
-                *score_rows(found, columns),
-            ]
+            rows += [[f"{task} ({tested_on(found, study.pack.spec.group_by)})"], *score_rows(found, columns)]
             muted |= set(order) - set(study.sources)
         if rows:
             parts.append(html.table([f"{score} %", *columns], rows, muted=muted, label=score))
@@ -90,9 +85,7 @@ def _target_table(study: Study, task: str, found: dict[str, Any]) -> Markup:
         error = ("" if c is None else error_text(c) for c in cells)
         rows.append([source, *(text for pair in zip(score, error, strict=True) for text in pair)])
     heads = [head for m in columns_of(found) for head in (f"{m}: R2 %", "mean absolute error")]
-    table = html.table(
-        [task, *heads], rows, muted=set(sources_of(found)) - set(study.sources), label=f"{task}: targets"
-    )
+    table = html.table([task, *heads], rows, muted={*sources_of(found)} - {*study.sources}, label=f"{task}: targets")
     return table + (html.paragraph(f"{clipped}.") if (clipped := clipped_text(found)) else "")
 
 
@@ -126,7 +119,5 @@ def values(study: Study) -> list[Markup]:
             drawn.append(study.figure(f"predicted {name}", drawing, f"Predicted against true {name}. {text}", text))
     if not drawn:
         return []
-    intro = (
-        f"A point is a test row ({study.sources[0]}). A flat cloud means that the probe answers about the same for all."
-    )
+    intro = f"A point is a test row ({study.sources[0]}). A flat cloud: the probe answers about the same for all."
     return [html.paragraph(intro), html.grid(drawn)]

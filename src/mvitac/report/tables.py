@@ -51,12 +51,13 @@ def print_summary(result: dict[str, Any], file: TextIO | None = None, *, probe: 
 
     ``file``: where to, default stdout; likewise below.
     """
-    trained = []
+    trained, by, few = [], result["group_by"], 10
     for name, task in result["summary"].items():
         trained += [{"source": s, "seed": seed} for m in task.values() for s, v in m.items() for seed in v["seeds"]]
         modalities, score = columns_of(task), score_name(task)
         seeds = max((len(v["seeds"]) for m in task.values() for v in m.values()), default=0)
-        about = f"{probe_name(probe, score)}; {seeds} seed{'s' * (seeds != 1)}; {tested_on(task, result['group_by'])}"
+        few = min(v["groups"] for m in (*task.values(), {"": {"groups": few}}) for v in m.values())
+        about = f"{probe_name(probe, score)}; {seeds} seed{'s' * (seeds != 1)}; {tested_on(task, by)}"
         title = f"{result['data']}: {name} ({about})"
         # LEAK on a line of its own, else the table is too wide.
         rows = [[cell.replace(" LEAK", "\nLEAK") for cell in row] for row in score_rows(task, modalities)]
@@ -69,14 +70,18 @@ def print_summary(result: dict[str, Any], file: TextIO | None = None, *, probe: 
         if clipped := clipped_text(task):
             print(clipped, file=file)
     _print_notes(result, trained, file)
+    if few < 10:
+        hint = f"hint: {few} test {by}{'s' * (few > 1)} tell little: --folds 5 tests every {by} no run learned from"
+        print(textwrap.fill(hint, 80, subsequent_indent="  "), file=file)
 
 
 def _print_notes(result: dict[str, Any], records: Sequence[dict[str, Any]], file: TextIO | None) -> None:
     """Print what the intervals of ``records`` cover, and what limits the result."""
-    print(f"95 % intervals: {covered(result['group_by'], records)}.", file=file)
+    said = f"95 % intervals: {covered(result['group_by'], records)}."
+    print(textwrap.fill(said, 80, subsequent_indent="  "), file=file)
     for kind, key in (("note", "notes"), ("LEAK", "leaks")):
         for text in result.get(key, ()):
-            print(f"{kind}: {text}", file=file)
+            print(textwrap.fill(f"{kind}: {text}", 80, subsequent_indent="  "), file=file)
 
 
 def _targets(name: str, task: dict[str, Any]) -> str:

@@ -267,7 +267,7 @@ def test_the_command_on_a_source(tmp_path: Path, capsys: pytest.CaptureFixture[s
     command = ["data", "check", "--data", "folder", "--path", str(tmp_path / "m.csv"), "--labels", "label"]
     command += ["--quiet", "--workers", "1"]
     assert main(command) == 2
-    assert "row 6: " in capsys.readouterr().out
+    assert "row 6:" in capsys.readouterr().out
     (tmp_path / "m.csv").write_text("\n".join([*rows, "30.png,a,g0,train"]))  # g0 is in test
     assert main([*command, "--json", str(tmp_path / "leak.json")]) == 2
     told = {f["item"]: f for f in json.loads((tmp_path / "leak.json").read_text())["findings"]}

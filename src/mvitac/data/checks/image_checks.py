@@ -18,9 +18,7 @@ def constant_frames(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     """Find constant images: a closed shutter, a failed decode, floats 0 to 1 stored as bytes."""
     found = {name: np.flatnonzero(one.has & ~one.seen) for name, one in looks.items()}
     rows = np.unique(np.concatenate(list(found.values()))).tolist()
-    notes = [
-        f"{name}: {share(len(r), pack.num)}, first {pack.column('id')[r[0]]}" for name, r in found.items() if len(r)
-    ]
+    notes = [f"{m}: {share(len(r), pack.num)}, first {pack.column('id')[r[0]]}" for m, r in found.items() if len(r)]
     evidence = "; ".join(notes) or f"none among {pack.num} rows"
     advice = "look whether the sensor or the decoder failed, and leave these rows out"
     broken = len(rows) > 0.05 * pack.num

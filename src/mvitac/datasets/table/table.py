@@ -57,7 +57,8 @@ class RowsConfig(DatasetConfig, ABC):
     """Column of the group (object, recording), the unit of splits and confidence intervals; default: "group" if it
     exists, else the video of the row's frame, else each row is its own group."""
     touch_group: str | None = None
-    """Column of near-duplicates (one touch, one grasp), which a batch keeps apart; default: the group."""
+    """Column of near-duplicates (one touch, one grasp), which a batch keeps apart; default: the recording, episode or
+    demonstration of the group, where the data knows it, else the group."""
     split: str | None = None
     """Column with train, val, test or unlabelled; default: "split" if it exists, else "by-group", which assigns whole
     groups using the next three fields."""
@@ -212,6 +213,8 @@ class Rows(Source):
         else:
             group_by, groups = splits.group_by_video(table.root, table.numbers, [table.images[c] for c in self._images])
         touch_groups = table.filled(config.touch_group, "touch_group") if config.touch_group else groups
+        if not config.touch_group and table.group not in (None, self._group):
+            touch_groups = [f"{g}/{row[table.group]}" for g, row in zip(groups, table.rows, strict=True)]
         counts = all_hold(config.label_only, table)
         read = [columns.read_task(table, column, counts) for column in label_columns]
         values, measured = columns.read_values(table, value_tasks, counts)
@@ -229,6 +232,7 @@ class Rows(Source):
         row_bytes = 3 * config.size**2 * len(self._images)
         self._items = bundles(self._rows, max(1, min(MAX_TOGETHER, MAX_TOGETHER_BYTES // row_bytes)))
         self._stamps = [one_stamp(stamps[r.path] for i in item for r in self._rows[i].refs()) for item in self._items]
+        cuts = {column: ":".join(map(str, look["crop"])) for column, look in config.looks().items() if "crop" in look}
         self._spec = DataSpec(
             name=config.title or (config.path if config.path.is_dir() else config.path.parent).resolve().name,
             vision_channels=3 if self._vision else 0,
@@ -241,6 +245,7 @@ class Rows(Source):
             source=config.source_url or "not given",
             notes=self._notes(table, group_by, assigned),
             difference=config.difference,
+            crop={m: ", ".join(cuts[c] for c in own if c in cuts) for m, own in asked.items() if {*own} & {*cuts}},
         )
 
     def _select(self, table: Manifest) -> tuple[Manifest, list[Background]]:
