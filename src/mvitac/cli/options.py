@@ -40,12 +40,12 @@ def parse(
         options["default"] = default
     if description:
         options["description"] = inspect.cleandoc(description)
-    boxed = io.StringIO()
+    boxed, shown = io.StringIO(), io.StringIO()
     try:
         with contextlib.redirect_stderr(boxed):
             if {"-h", "--help"} & set(argv):
                 # A flag is shown in the one form that changes something; --x and --no-x are both accepted.
-                with _joined_lines(), contextlib.redirect_stdout(io.StringIO()) as shown:
+                with _joined_lines(), contextlib.redirect_stdout(shown):
                     tyro.cli(kind, **options, config=(tyro.conf.FlagCreatePairsOff, tyro.conf.SuppressFixed))  # type: ignore[arg-type]
             with _columns("10000"):  # the lines of an error must not be wrapped
                 return tyro.cli(kind, **options)  # type: ignore[arg-type]
