@@ -284,7 +284,8 @@ FORGED: dict[str, tuple[Change, str]] = {
     "unit": (put(*VALUES, "targets", 0, 1, value="kN"), "is scored on other rows"),
     "infinity": (put(*VALUES, "sums", "error", 0, 0, value=1e999), "is not finite"),
     "text": (put(*RECORDS, 0, "sums", "correct", 0, value="x"), "its sums are no numbers"),
-    "no sums": (put(*RECORDS, 0, "sums", value={}), "its sums are"),
+    "no sums": (put(*RECORDS, 0, "sums", value={}), "its sums"),
+    "hidden score": (put(*RECORDS, 0, "task", value="light"), "its fields are"),
     "rows": (put(*RECORDS, 0, "sums", "n", value=lambda sizes: [2 * n for n in sizes]), "is scored on other rows"),
     "weights twice": (put("encoder", value=lambda e: e | {"seeds": [0, 1], "weights": 2 * e["weights"]}), "has 1 wei"),
     "group twice": (put("blocks", 0, "groups", value=lambda names: [*names[:-1], names[0]]), "a group is there twice"),
@@ -404,13 +405,15 @@ def test_results_of_other_suites_are_refused(
         resigned(value)
 
     old = changed(results[1], tmp_path / "old.json", of_v1, signed=True)
-    assert "is of sim-v1, this version has sim-v3: run the bench again" in said(capsys, "bench", "check", old)
+    assert "is of another sim-v1 than sim-v3 of this version: run the bench again" in said(
+        capsys, "bench", "check", old
+    )
     monkeypatch.setattr(suite, "SUITES", tmp_path)
     (tmp_path / "toys.toml").write_text(SUITE)
     assert main(["bench", "check", str(results[0])]) == 0
     capsys.readouterr()
     (tmp_path / "toys.toml").write_text(SUITE.replace("seed = 0\nuntrained", "seed = 7\nuntrained"))
-    assert "is of another version of toys" in said(capsys, "bench", "check", results[0])
+    assert "is of another toys than toys of this" in said(capsys, "bench", "check", results[0])
 
 
 def test_encoders_that_cannot_be_scored_are_refused(
@@ -473,8 +476,8 @@ def test_data_is_compared_with_the_pins(root: Path) -> None:
     assert not isinstance(opened, str) and set(opened.digests) == {"rows", "touch", "vision"}
     (form,) = one.forms
     same, pixels, rows = (replace(form, pins={**opened.digests, **new}) for new in ({}, {"touch": "0"}, {"rows": "0"}))
-    found = [suite.pinned(each, opened.digests) for each in (form, same, pixels, rows)]
-    assert found == ["not pinned", "same", "other pixels", "other rows"]
+    found = [suite.pinned(f, opened.digests) for f in (form, same, pixels, rows, replace(form, pins={"touch": "0"}))]
+    assert found == ["not pinned", "same", "other pixels", "other rows", "other rows"]
     with pytest.raises(ValueError, match="other rows, labels or splits than the suite"):
         open_set(replace(one, forms=(rows,)), root)
     made = replace(rows, at={}, data={**form.data, "path": str(root / "stripes")})  # as another processor makes it
@@ -494,14 +497,20 @@ def test_shipped_suites_keep_their_definitions() -> None:
     ("text", "expected"),
     [
         ("name = ", "is not a suite"),
-        (SUITE.replace('"folded"', '"stripes"'), "two sets have one name"),
+        (SUITE.replace('"folded"', '"stripes"'), "of stripes, stripes, elsewhere one is there twice"),
+        (
+            SUITE.replace("labels = [0.3]", "labels = [0.3, 0.3]"),
+            "task 'pattern': give touch, vision or both, and nothing",
+        ),
+        (SUITE.replace('"toys"', '"sim-v1"'), "sim-v3 of this version is another suite: give it another name"),
+        (SUITE.replace(RANDOM.format(1), RANDOM.format(1) + ",reads=touch"), "which reads both"),
         (SUITE.replace('"clone" }', '"../clone" }', 1), "not a place below --data-root"),
         (SUITE.replace('name = "pack" }', 'name = "pack", path = "/etc" }', 1), "names a place in 'path'"),
         (SUITE.replace(FORM, 'data = { name = "mix", parts = ["/a", "/b"] }', 1), "a place in 'parts'"),
-        (SUITE.replace(RANDOM.format(1), "external:python:antigravity:fly"), "weights=random"),
+        (SUITE.replace(RANDOM.format(0), "external:python:antigravity:fly"), "weights=random, which"),
         (SUITE.replace("external:timm/resnet18.tv_in1k", RANDOM.format(1)), "give external:timm/NAME"),
         (SUITE.replace("folds = 3", "folds = -3"), "folds -3: give 2 or more"),
-        (SUITE.replace('probes = ["linear"]', "probes = []"), "needs at least one of probes, untrained and sets"),
+        (SUITE.replace('probes = ["linear"]', 'probes = ["paper"]'), "needs linear or knn"),
         (SUITE.replace("labels = [0.3]", "labels = [nan]"), "task 'pattern': labels nan: give fractions above 0"),
     ],
 )

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import timm
 import torch
-from torch import Tensor
 
 import mvitac
 from mvitac.bench.external import ExternalModel, open_model
@@ -26,14 +25,9 @@ from mvitac.recipes import recipe
 from support.toy import toy_pack
 
 
-def levels(*values: int) -> Tensor:
-    """One image of 8 x 8 pixels per value, uint8 [1, F, 3, 8, 8]."""
-    return torch.tensor(values, dtype=torch.uint8).view(1, -1, 1, 1, 1).expand(1, len(values), 3, 8, 8)
-
-
 def test_frames_are_newest_first_and_the_oldest_is_repeated() -> None:
     made = Preprocessing(frames=3, mean=(0, 0, 0), std=(1, 1, 1), size=(8, 8))
-    found = made(levels(255, 0))
+    found = made(torch.tensor([255, 0], dtype=torch.uint8).view(1, -1, 1, 1, 1).expand(1, 2, 3, 8, 8))
     assert found.shape == (1, 9, 8, 8) and found[0, :, 0, 0].tolist() == [1, 1, 1, 0, 0, 0, 0, 0, 0]
 
 

@@ -153,6 +153,7 @@ WORDS: list[tuple[str, str, str]] = [
     (PACKED, "--values farce:N", "did you mean 'force'"),
     (PACKED, "--values force:N weight=force:mN", "two units"),
     (PACKED, "--labels force --values force:N", "'force'"),
+    (PACKED, "--values =force:N", "give the columns one name"),
 ]
 
 

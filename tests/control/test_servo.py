@@ -20,6 +20,7 @@ from mvitac.control.servo import TASKS, Edge, Surface, presses, task_of, texture
 from mvitac.control.servo_rows import Condition, Episode, Servo
 from mvitac.control.suite import Row, rows_of, score
 from mvitac.system.files import digest
+from support.forged_packs import put
 
 RANDOM = "external:timm/test_resnet,weights=random,size=32,seed={}"
 KINDS = [kind for task in TASKS.values() for kind in task.kinds]
@@ -139,10 +140,6 @@ def test_a_result_repeats_and_says_how_good_each_row_is(
     assert f"{len(value['rows'])} rows hold" in capsys.readouterr().out
 
 
-def _better(value: dict[str, Any]) -> None:
-    value["rows"][0]["cells"][0]["mm"][0] = -1.0
-
-
 def _true(value: dict[str, Any]) -> None:
     next(row for row in value["rows"] if row["source"] == "true pose")["cells"][3]["mm"][0] += 0.5
 
@@ -153,7 +150,7 @@ def _late(value: dict[str, Any]) -> None:
 
 
 CHANGES: dict[str, Callable[[dict[str, Any]], Any]] = {
-    "no episodes give": _better,
+    "no episodes give": put("rows", 0, "cells", 0, "mm", 0, value=-1.0),
     "other sums here": _true,
     "the suite asks for": lambda value: value["rows"].pop(3),
     "not of this version's": _late,

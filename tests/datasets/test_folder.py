@@ -274,6 +274,7 @@ def test_class_folders_pair_by_name(tmp_path: Path, kind: str) -> None:
         picture(tmp_path / ("" if kind == "plain" else "vision") / label / f"{i}.png", i)
         if kind == "pairs" or (kind == "a gap" and i != 5):
             picture(tmp_path / f"touch/{label}/{i}.bmp", 100 + i)
+    picture(tmp_path / ("" if kind == "plain" else "vision") / ".thumbnails/7.png")
     config = FolderConfig(path=tmp_path, size=16, pictures="vision")
     if kind == "a gap":
         with pytest.raises(ValueError, match=r"\(vision/moss/5\.png\) has no touch path: .*allow-missing"):
@@ -486,11 +487,9 @@ BAD: dict[str, tuple[Change | None, dict[str, Any], str]] = {
     "label like a name": (numbered(material="m{}"), {}, r"'material' has another value in each of its 24 rows"),
     "empty group": (one(9, object=""), {}, r"row 9 .*column 'object' \(group\) is empty"),
     "empty split": (one(5, side=""), {"split": "side"}, r"row 5 .*'side' \(split\) is empty"),
-    "validation": (
-        one(13, side="validation"),
-        {"split": "side"},
-        r"unknown split in column 'side' 'validation': choose from train, val, test, unlabelled",
-    ),
+    "validation": (one(13, side="validation"), {"split": "side"}, r"unknown split in column 'side' 'validation': "),
+    "control character": (one(13, object="a\x93"), {}, r"control character in a name, .*a\\x93"),
+    "escape": (one(13, material="\x1b[2J"), {}, r"control character in a name, .*u001b"),
     "leak of a touch": (each(seq=0), {"touch_group": "seq"}, r"1 of 1 touch groups are.*give the group"),
     "leak of an image": (each(vision="vision/00.png"), {}, r"1 of 1 vision images are in more than one split"),
     "nothing to train on": (each(side="test"), {"split": "side"}, r"'side' gives no rows of train"),
@@ -548,26 +547,25 @@ def test_bad_files_are_named(tmp_path: Path, name: str) -> None:
 
 
 def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
-    def refused(path: Path, says: str) -> None:
-        with pytest.raises(ValueError, match=says):
-            FolderConfig(path=path).source()
-
     for suffix in ("csv", "jsonl"):
         write(rows, tmp_path / f"manifest.{suffix}")
-    refused(tmp_path, "manifest.csv and manifest.jsonl")
-    lonely = tmp_path / "lonely"
-    picture(lonely / "vision/a/1.png")
-    picture(lonely / "touch/b/1.png")
-    refused(lonely, r"row 2 \(touch/b/1\.png\) has no vision path: .*allow-missing")
-    for name in ("1", "a/2"):
-        picture(tmp_path / f"half flat/touch/{name}.png")
-    refused(tmp_path / "half flat", r"1\.\* is not in a class folder")
-    for suffix in ("png", "bmp"):
-        picture(tmp_path / f"twins/touch/a/1.{suffix}")
-    refused(tmp_path / "twins", "differ in their suffix only")
-    for name in ("train/a/1", "test/b/2", "validation/a/3"):
-        picture(tmp_path / f"beside/{name}.png")
-    refused(tmp_path / "beside", "images in validation beside train, test: rename or remove it")
+    latin = [f"touch/{label}/{i}.png" for label in ("a", "b\udcff") for i in range(9)]  # a name that is not UTF-8
+    for folder, names, says in (
+        ("", [], "manifest.csv and manifest.jsonl"),
+        (
+            "lonely",
+            ["vision/a/1.png", "touch/b/1.png"],
+            r"row 2 \(touch/b/1\.png\) has no vision path: .*allow-missing",
+        ),
+        ("half flat", ["touch/1.png", "touch/a/2.png"], r"1\.\* is not in a class folder"),
+        ("twins", ["touch/a/1.png", "touch/a/1.bmp"], "differ in their suffix only"),
+        ("beside", ["train/a/1.png", "test/b/2.png", "validation/a/3.png"], "images in validation beside train, test:"),
+        ("latin", latin, "control character in a name, "),
+    ):
+        for name in names:
+            picture(tmp_path / folder / name)
+        with pytest.raises(ValueError, match=says):
+            FolderConfig(path=tmp_path / folder).source()
 
 
 def test_commands_say_what_a_group_is(tmp_path: Path, rows: Table, capsys: pytest.CaptureFixture[str]) -> None:

@@ -206,6 +206,7 @@ EXPORTS: dict[str, tuple[dict[str, Any], str]] = {
         "no tolerance": (lambda about: about.pop("tolerance"), "is damaged"),
         "no spread": (put("values", value={"force": [NO_SPREAD]}), "0 edges and 0 spreads: give n ascending"),
         "no inputs": (put("inputs", value={}), "cannot be run"),
+        "too few classes": (put("classes", "pattern", value=["a"]), "damaged.*classes of pattern"),
     }.items()
 }
 FORGED = [("artifact", *each) for each in ARTIFACTS.values()] + [("onnx", *each) for each in EXPORTS.values()]

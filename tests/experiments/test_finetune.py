@@ -143,12 +143,9 @@ def edited(pack: Pack, to: Path, **columns: Any) -> Path:
     return build(Other(), to, size=pack.size, workers=1, quiet=True).path
 
 
-def next_class_in_test(row: dict[str, Any]) -> int:
-    return (row["label_pattern"] + (row["split"] == "test")) % 3
-
-
 def test_test_labels_decide_nothing(ancestor: Path, pack: Pack, tuned: Path, tmp_path: Path) -> None:
-    other = Pack(edited(pack, tmp_path / "other", label_pattern=next_class_in_test))
+    wrong = {"label_pattern": lambda row: (row["label_pattern"] + (row["split"] == "test")) % 3}
+    other = Pack(edited(pack, tmp_path / "other", **wrong))
     assert other.digest != pack.digest
     result = tune(ancestor, other, tmp_path / "out", replace(ASKED, from_scratch=False))
     assert len(tried := tried_in(tmp_path / "out")) == 2 and tried.items() <= tried_in(tuned).items()
@@ -185,7 +182,13 @@ def test_what_was_tried_on_other_labels_is_tried_again(ancestor: Path, pack: Pac
     shutil.rmtree(changing.path)
     edited(pack, changing.path, label_pattern=lambda row: (row["label_pattern"] + 1) % 3)
     tune(ancestor, Pack(changing.path), out, asked, resume=True)
-    assert [name.split(" (")[0] for name in read_json(out / "choice.json", "")].count(first) == 2
+    tried = read_json(out / "choice.json", "")
+    assert [name.split(" (")[0] for name in tried].count(first) == 2
+    shutil.rmtree(changing.path)
+    edited(pack, changing.path, label_pattern=lambda row: (row["label_pattern"] + 2) % 3)
+    with pytest.raises(ValueError, match="seed0 holds a different run"):
+        tune(ancestor, Pack(changing.path), out, asked, resume=True)
+    assert read_json(out / "choice.json", "") == tried  # at once
 
 
 SWAPPED = {"test": "train", "train": "test", "val": "val"}

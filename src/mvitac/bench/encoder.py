@@ -72,7 +72,7 @@ def measure(
     """
     models = [load(place) for place in places]
     encoder = describe(models, places, about)
-    path = out / f"{suite.name}-{slug(encoder['name'])}.json"
+    path = out / f"{slug(suite.name + '-' + encoder['name'])}.json"
     check_place(path)
     if path.exists() and (old := read_signed(path, form)["encoder"]["weights"]) != encoder["weights"]:
         raise ValueError(f"{path} is the result of other weights ({old[0][:12]}): give --name, or another --out")

@@ -13,7 +13,6 @@ someone repeats them.
 """
 
 import json
-import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -22,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from mvitac.bench.external.adapters import parse
-from mvitac.bench.suite import Suite, SuiteSet, SuiteTask, find_suite, pinned, shipped
+from mvitac.bench.suite import Suite, SuiteSet, SuiteTask, find_suite, outdated, pinned, shipped
 from mvitac.evaluation import few_labels
 from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.leaks import declared_leak
@@ -36,7 +35,6 @@ VOLATILE = ("digest", "about")  # fields that the digest leaves out
 KEY = ("source", "seed", "modality", "probe")
 COUNTS = ("n", "correct")  # sums per group of classes: rows, and those that are right
 ABOUT_ROWS = ("n", "value", "squared_value")  # sums that depend on the rows alone
-VERSION = re.compile(r"-v\d+$")  # at the end of a suite's name
 GUESS = "majority or mean"  # what the page calls these two controls
 MAX_NAME = 200
 
@@ -122,19 +120,15 @@ def read_result(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} is damaged ({error}): run the bench again") from None
     if value.get("suite_digest") != suite.digest():
         raise ValueError(f"{path}: the suite inside does not have the digest that the file says: run the bench again")
-    if suite.name in shipped() and find_suite(suite.name).digest() != suite.digest():
-        raise ValueError(f"{path} is of another version of {suite.name} than this one: run the bench again")
-    now = {VERSION.sub("", name): name for name in shipped()}.get(VERSION.sub("", suite.name), suite.name)
-    if now != suite.name:
-        raise ValueError(f"{path} is of {suite.name}, this version has {now}: run the bench again")
+    if now := outdated(suite):
+        raise ValueError(f"{path} is of another {suite.name} than {now} of this version: run the bench again")
     return value
 
 
 def suite_of(value: dict[str, Any]) -> Suite:
     """The definition inside a result. One of this version has its pins; no file can bring its own."""
     suite = from_json(Suite, value["suite"], "suite")
-    known = find_suite(suite.name) if suite.name in shipped() else None
-    return known if known and known.digest() == suite.digest() else suite
+    return find_suite(suite.name) if suite.name in shipped() and not outdated(suite) else suite
 
 
 def pinned_of(suite: Suite, block: dict[str, Any]) -> str:
@@ -233,8 +227,8 @@ def _expected(suite: Suite, ask: SuiteTask, block: dict[str, Any], seeds: Sequen
 def _impossible(record: dict[str, Any], num_groups: int) -> str:
     """Why no predictions give the sums of a record; "" if some do."""
     names = SUMS if "targets" in record else COUNTS
-    if {*record["sums"]} != {*names}:
-        return f"its sums are {sorted(record['sums'])}"
+    if {*record["sums"]} != {*names} or {*record} - {*KEY, "clipped", "targets", "sums"}:
+        return f"its fields are {sorted(record)}, its sums {sorted(record['sums'])}"
     try:
         sums = {name: np.array(record["sums"][name], float) for name in names}
     except (TypeError, ValueError):

@@ -4,6 +4,7 @@ A suite fixes data, rows, splits, probes, seeds and controls. Its digest covers 
 digests of the data that was measured. A definition that changes gets another name (sim-v3).
 """
 
+import re
 import tomllib
 import typing
 from collections.abc import Sequence
@@ -19,11 +20,13 @@ from mvitac.data.several import JoinedPack
 from mvitac.data.spec import AnyTask, Task
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.table.splits import folds
+from mvitac.evaluation.probe import VALUE_PROBES
 from mvitac.evaluation.probe_config import Probe
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.system.files import brief, digest
 
 SUITES = Path(__file__).parent / "suites"
+VERSION = re.compile(r"-v\d+$")  # at the end of a suite's name
 Pinned = Literal["same", "other pixels", "other rows", "not pinned"]
 """Data beside the pins of its suite. Only simulated data may have other rows: those of another processor's arithmetic."""
 
@@ -40,8 +43,8 @@ class SuiteTask:
         for share in self.labels:
             if not 0 < share < 1:
                 raise ValueError(f"task {self.name!r}: labels {share}: give fractions above 0 and below 1")
-        if not self.modalities:
-            raise ValueError(f"task {self.name!r} has no modalities: give touch, vision or both")
+        if not self.modalities or len({*self.modalities, *self.labels}) < len((*self.modalities, *self.labels)):
+            raise ValueError(f"task {self.name!r}: give touch, vision or both, and nothing twice")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,8 +78,8 @@ class SuiteSet:
             raise ValueError(f"set {self.name!r}: folds {self.folds}: give 2 or more, or 0 for the data's own split")
         if self.val_every < 1:
             raise ValueError(f"set {self.name!r}: val_every {self.val_every}: give 1 or more")
-        if not self.tasks or not self.forms:
-            raise ValueError(f"set {self.name!r} needs at least one task and one form")
+        if not self.tasks or not self.forms or len({task.name for task in self.tasks}) < len(self.tasks):
+            raise ValueError(f"set {self.name!r} needs at least one task and one form, and no task twice")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,11 +97,11 @@ class Suite:
     def __post_init__(self) -> None:
         if self.seed < 0:
             raise ValueError(f"suite {self.name!r}: seed {self.seed}: give a number >= 0")
-        if not (self.probes and self.untrained and self.sets):
-            raise ValueError(f"suite {self.name!r} needs at least one of probes, untrained and sets")
-        names = [one.name for one in self.sets]
-        if len(set(names)) < len(names):
-            raise ValueError(f"suite {self.name!r}: two sets have one name")
+        if not ({*self.probes} & {*VALUE_PROBES} and self.untrained and self.sets):
+            raise ValueError(f"suite {self.name!r} needs linear or knn, and at least one of untrained and sets")
+        for each in (self.probes, [parse(text).seed for text in self.untrained], [one.name for one in self.sets]):
+            if len({*each}) < len(each):
+                raise ValueError(f"suite {self.name!r}: of {', '.join(map(str, each))} one is there twice")
 
     def definition(self) -> dict[str, Any]:
         """The suite as JSON, without its pins."""
@@ -127,14 +130,20 @@ def find_suite(name: str) -> Suite:
         suite = from_json(Suite, tomllib.loads(file.read_text()), "suite")
         for form in (form for one in suite.sets for form in one.forms):
             _check_places(form, _config(form, Path(), form.data))
-        for text in suite.untrained:
-            if getattr(parse(text), "weights", "") != "random":
-                raise ValueError(f"untrained {text!r}: give external:timm/NAME,weights=random")
-        if getattr(parse(suite.imagenet), "weights", "") != "pretrained":
-            raise ValueError(f"imagenet {suite.imagenet!r}: give external:timm/NAME")
+        for text, weights in {**dict.fromkeys(suite.untrained, "random"), suite.imagenet: "pretrained"}.items():
+            if (getattr(adapter := parse(text), "weights", ""), adapter.reads) != (weights, "both"):
+                raise ValueError(f"control {text!r}: give external:timm/NAME,weights={weights}, which reads both")
+        if file == Path(name) and (now := outdated(suite)):
+            raise ValueError(f"{now} of this version is another suite: give it another name than {suite.name}")
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError) as error:
         raise ValueError(f"{file} is not a suite ({brief(error)})") from None
     return suite
+
+
+def outdated(suite: Suite) -> str:
+    """The suite of this version that has the name of ``suite``, or its name but for the version, and is another; or ""."""
+    now = {VERSION.sub("", name): name for name in shipped()}.get(VERSION.sub("", suite.name), "")
+    return now if now and (now != suite.name or find_suite(now).digest() != suite.digest()) else ""
 
 
 def _check_places(form: Form, config: DatasetConfig) -> None:
@@ -191,7 +200,7 @@ def pinned(form: Form, found: dict[str, str]) -> Pinned:
     """Digests of data beside the pins of ``form``."""
     if not form.pins:
         return "not pinned"
-    if found["rows"] != form.pins["rows"]:
+    if found["rows"] != form.pins.get("rows"):
         return "other rows"
     return "same" if found == form.pins else "other pixels"
 

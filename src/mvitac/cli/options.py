@@ -153,8 +153,8 @@ def save_json(path: Path | None, value: Any, *, sealed: bool = False) -> None:
 
 
 def _one_line(boxed: str, prog: str) -> str:
-    """tyro's error without its frame and the repeated help of the option, which names its option or field."""
+    """tyro's error without its title, frame and the repeated help of the option, which names its option or field."""
     text = re.sub(r"\x1b\[[0-9;]*m", "", boxed)
-    lines = [line.strip(" │|") for line in text.splitlines() if not re.match(r"\s*([╭╰├]|[│|]?\s*[-─]{3,})", line)]
+    lines = [line.strip(" │|") for line in text.splitlines()[1:] if not re.match(r"\s*(╰|[│|]?\s*[-─]{3,})", line)]
     text = re.split(r" (?:Argument helptext:|For full helptext)", " ".join(line for line in lines if line))[0]
     return f"{text} (see mvitac {prog} --help)"

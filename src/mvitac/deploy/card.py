@@ -2,6 +2,7 @@
 
 import json
 import textwrap
+from functools import partial
 from typing import Any
 
 import jinja2
@@ -44,11 +45,8 @@ def card(model: Model, about: dict[str, Any]) -> str:
             listed=listed,
         )
     as_it_is = ("|", "license")  # tables and the front matter
-    return "\n".join(line if line.startswith(as_it_is) else _wrapped(line) for line in text.split("\n"))
-
-
-def _wrapped(line: str) -> str:
-    return line if len(line) <= 120 else textwrap.fill(line, 120, break_long_words=False, break_on_hyphens=False)
+    wrap = partial(textwrap.fill, width=120, break_long_words=False, break_on_hyphens=False)
+    return "\n".join(line if line.startswith(as_it_is) else wrap(line) for line in text.split("\n"))
 
 
 def _harmless(value: object) -> str:

@@ -96,6 +96,8 @@ class Engine:
             found = self(**{m: check[f"input_{m}"] for m in self.inputs})
         except (RuntimeError, ValueError) as error:  # the model has other inputs than export.json says
             raise ValueError(f"{self.folder} cannot be run ({brief(error)}): export it again") from None
+        for task, names in self.classes.items():
+            assert found[f"probability_{task}"].shape[1] == len(names), f"classes of {task}"
         here, allowed = f"{self.folder}: on this machine", self.meta["tolerance"]["min_cosine"]
         for name in (name for name in self.meta["outputs"] if name.startswith("embedding_")):
             least = float(cosines(found[name], check[name]).min())

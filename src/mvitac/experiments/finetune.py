@@ -33,10 +33,11 @@ from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import Model, fresh, load
 from mvitac.nn.encoders import IMAGENET, EncoderConfig, Encoders
 from mvitac.nn.initial import Init
-from mvitac.run import Optim, Run
+from mvitac.run import Optim, Run, load_run
 from mvitac.system.files import check_place, digest, read_json, write_json
 from mvitac.system.progress import duration
 from mvitac.training.loop import train
+from mvitac.training.setup import check_same
 from mvitac.transforms.random_views import Augment, ViewAugment
 
 FROZEN, SCRATCH = "frozen, linear probe", "from scratch"
@@ -214,8 +215,9 @@ class _Job:
             return str(error)
         return ""
 
-    def folder(self, percent: float) -> Path:
-        return self.out if percent == 100 else self.out / f"{percent:g}-percent"
+    def folder(self, percent: float, kind: str = "") -> Path:
+        found = self.out if percent == 100 else self.out / f"{percent:g}-percent"
+        return found / "scratch" if kind == SCRATCH else found
 
     def test(self, task: AnyTask) -> np.ndarray:
         return split_rows(self.pack, task, self.modality).test
@@ -238,7 +240,7 @@ def _fraction(job: _Job, percent: float, sources: list[Source] | None) -> tuple[
     records = []
     for seed in range(job.asked.seeds):
         for kind in job.kinds:
-            path = job.folder(percent) / ("scratch" if kind == SCRATCH else "") / f"seed{seed}"
+            path = job.folder(percent, kind) / f"seed{seed}"
             run = job.run_of(percent, seed, kind, settings[kind])
             job.say(f"{percent:g} %: {kind}, seed {seed}, {run.steps} steps of {run.batch_size}")
             more: dict[str, Any] = {"loggers": (job.forecast,), "validate": False}  # all groups are learned from
@@ -258,6 +260,9 @@ def _choose(job: _Job, percent: float, kind: str) -> dict[str, Any]:
     """The settings with the lowest ``mean_error`` on held-out groups of the first seed, tried one after the other."""
     tried: dict[str, tuple[float, ...]] = {"lr": job.asked.lr, "steps": job.asked.steps}
     best: dict[str, Any] = {name: values[0] for name, values in tried.items()}
+    if ((path := job.folder(percent, kind) / "seed0") / "run.json").exists():  # before hours of trying
+        old = load_run(path)[0]
+        check_same(job.run_of(percent, 0, kind, {"lr": old.optim.lr, "steps": old.steps}), job.pack, path)
     if why := job.too_few(percent):
         job.say(f"{percent:g} %: {kind}: {why}: the first of --lr and --steps is used")
         return best

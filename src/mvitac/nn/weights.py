@@ -87,7 +87,7 @@ def said_trained_on(file: Path) -> str:
 
 
 def _flat(value: Any, start: str = "") -> State:
-    if isinstance(value, Tensor):
+    if isinstance(value, Tensor) and (value.layout, value.device.type) == (torch.strided, "cpu"):  # no sparse one
         return {start: value}
     inner = value.items() if isinstance(value, dict) else ()
     return {n: t for key, each in inner for n, t in _flat(each, f"{start}.{key}" if start else str(key)).items()}

@@ -119,14 +119,17 @@ def fields_of(files: Path | str) -> Iterator[None]:
         raise ValueError(f"{files} is damaged: a field is missing or of another kind ({what}): make it again") from None
 
 
-_CONTROL = re.compile(r"\\u00(?:0[0-8bcef]|1.|7f|[89].)|\\u20(?:2[a-e]|6[6-9])|[\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+_CONTROL = re.compile(
+    r"\\u00(?:0[0-8bcef]|1.|7f|[89].)|\\u20(?:2[a-e]|6[6-9])|[\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
+)
 """What begins an escape sequence or turns text around, as itself or as JSON writes it: names may be a stranger's."""
 
 
 def parse_json(text: str) -> Any:
     """Parse JSON; ValueError if it is invalid, nested more deeply than Python can read, or holds a control character."""
     if found := _CONTROL.search(text):
-        raise ValueError(f"control character {found[0]!r} in a name: a terminal would obey it")
+        name = text[max(0, found.start() - 20) : found.end()]
+        raise ValueError(f"control character in a name, {name!r}: rename it, a terminal would obey it")
     try:
         return json.loads(text)
     except RecursionError:

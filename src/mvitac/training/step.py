@@ -71,7 +71,9 @@ class Step:
         assert isinstance(method, Contrastive)
         first_seed = seed + len(chunks) * world.rank  # each chunk has its own dropout, the same in both passes
         single = len(chunks) == 1  # keeps its graph and needs no second pass
-        statistics = [] if single else _running_statistics(method)
+        # Running statistics of BatchNorm in the trained modules; not those of momentum towers.
+        trained = (m for m in method.modules() if any(p.requires_grad for p in m.parameters(recurse=False)))
+        statistics = [] if single else [buffer for layer in trained for buffer in layer.buffers(recurse=False)]
         before = [buffer.clone() for buffer in statistics]
 
         def embed(views: Views, i: int) -> Embeddings:
@@ -112,12 +114,6 @@ class Step:
             torch.autograd.backward([z[name] for name in gradients], [pieces[i] for pieces in gradients.values()])
         world.sum_gradients(method)
         return losses
-
-
-def _running_statistics(method: Method) -> list[Tensor]:
-    """Running statistics of BatchNorm in the trained modules; not those of momentum towers."""
-    layers = (m for m in method.modules() if any(p.requires_grad for p in m.parameters(recurse=False)))
-    return [buffer for layer in layers for buffer in layer.buffers(recurse=False)]
 
 
 def build_optimiser(config: Optim, method: Method, encoders: Encoders) -> torch.optim.Optimizer:

@@ -60,10 +60,6 @@ class Preprocessing:
         if min(*self.size, self.frames) < 1 or not 0 < min(self.stride, *self.std) < math.inf:
             raise ValueError(f"size {self.size}, frames {self.frames}, stride {self.stride}, std {self.std}: 0 or less")
 
-    def input_shape(self) -> tuple[int, ...]:
-        """Shape of the network's input, for one image."""
-        return (3 * self.frames, *self.size)
-
     def __call__(self, images: Tensor) -> Tensor:
         """Prepare images [N, F, 3, H, W], uint8 or float in [0, 1], newest first.
 

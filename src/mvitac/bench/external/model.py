@@ -47,7 +47,7 @@ class ExternalEncoder(nn.Module):
         known = hashlib.sha256(f"{self.preprocessing} {digests}".encode()).digest()
         # A parameter, so that digests of the weights cover it and networks without weights have a device.
         self.identity = nn.Parameter(torch.frombuffer(bytearray(known), dtype=torch.uint8), requires_grad=False)
-        shape = self.preprocessing.input_shape()
+        shape = (3 * self.preprocessing.frames, *self.preprocessing.size)
         try:
             with torch.no_grad():
                 found = self.network(torch.zeros(2, *shape))

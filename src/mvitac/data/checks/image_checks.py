@@ -43,7 +43,8 @@ def red_and_blue(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         compared |= decided
         if swapped.any():
             rows += (mine := usable[swapped]).tolist()
-            note = f"{share(len(mine), len(usable))} have red and blue mirrored{_where(pack, mine)}"
+            groups = listed(np.unique(pack.column("group")[mine].astype(str)).tolist(), 3)
+            note = f"{share(len(mine), len(usable))} have red and blue mirrored, of {pack.spec.group_by} {groups}"
         notes.append(f"{name}: {note}")
     if not compared:
         return Finding("red and blue swapped", "not checkable", "; ".join(notes))
@@ -72,10 +73,6 @@ def _mirrored(thumbs: np.ndarray) -> tuple[np.ndarray, bool, str]:
     if alike < 0.8 or apart > 30:
         return none, True, f"two kinds of colour, but no mirror images ({alike:.2f})"
     return other, True, ""
-
-
-def _where(pack: Pack, rows: np.ndarray) -> str:
-    return f", of {pack.spec.group_by} {listed(np.unique(pack.column('group')[rows].astype(str)).tolist(), 3)}"
 
 
 def time_offset(pack: Pack, looks: dict[str, ImageStats]) -> Finding:

@@ -85,12 +85,12 @@ def with_elements(table: Manifest, names: Iterable[str]) -> Manifest:
 
 def value_task(text: str) -> ValueTask:
     """Parse "force_n:N", or "pose=z_mm:mm,tilt_deg:deg" for a task with several targets."""
-    name, _, listed = text.rpartition("=")
+    name, named, listed = text.rpartition("=")
     pairs = [part.strip().rpartition(":") for part in listed.split(",")]
     if not all(column and unit for column, _, unit in pairs) or len({column for column, _, _ in pairs}) < len(pairs):
         raise ValueError(f"values {text!r}: write column:unit, or name=column:unit,column:unit, e.g. force_n:N")
-    if not name and len(pairs) > 1:
-        raise ValueError(f"values {text!r}: give several columns one name, e.g. pose={listed}")
+    if not name.strip() and (named or len(pairs) > 1):
+        raise ValueError(f"values {text!r}: give the columns one name, e.g. pose={listed}")
     targets = tuple(Target(name=column, unit=unit) for column, _, unit in pairs)
     return ValueTask(name=name.strip() or targets[0].name, targets=targets)
 

@@ -53,7 +53,7 @@ def _split_rows(root: Path, split: str, plain: str, every: int) -> list[Row]:
     base = root / split
     named = [name for name in CAMERAS if (base / name).is_dir()]
     found = {name: _images_below(base / name) for name in named} or {plain: _images_below(base)}
-    keys = sorted(set[str]().union(*found.values()))
+    keys = sorted(key for key in set[str]().union(*found.values()) if "/." not in f"/{key}")  # no hidden thumbnails
     flat = [key for key in keys if "/" not in key]
     if flat and len(flat) < len(keys):
         raise ValueError(f"{base}: {flat[0]}.* is not in a class folder: put it in one, named by its class")
@@ -109,8 +109,8 @@ def list_videos(path: Path, names: Sequence[str], plain: str, every: int | None,
         if video.suffix.lower() in VIDEOS:
             parts = [*video.relative_to(path).parts[:-1], video.stem] if path.is_dir() else [video.stem]
             camera = next((name for name in names if name in parts), plain)
-            if not camera:
-                continue  # a camera that is not asked for
+            if not camera or any(part.startswith(".") for part in parts):
+                continue  # a camera that is not asked for, or what another system leaves beside a file
             recording = "/".join(part for part in parts if part != camera) or path.resolve().stem
             known = recordings.setdefault(recording, {}).setdefault(camera, video)
             if known != video:

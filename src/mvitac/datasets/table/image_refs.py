@@ -140,7 +140,7 @@ def picture(found: str | bytes | np.ndarray, ref: ImageRef) -> Image.Image:
     if not isinstance(found, np.ndarray):
         return decode(found if isinstance(found, str) else io.BytesIO(found), str(ref), ref.span)
     pixels = found
-    if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (1,), (2,), (3,)) or pixels.dtype.kind not in "biuf":
+    if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (1,), (2,), (3,)) or pixels.dtype.kind not in "iuf":
         raise ValueError(f"{ref} is {pixels.dtype} {list(pixels.shape)}: give numbers [height, width, 1 to 3 channels]")
     if not 0 < (num := pixels.shape[0] * pixels.shape[1]) <= MAX_PIXELS:
         raise ValueError(f"{ref} has {num:,} pixels: 1 to {MAX_PIXELS:,} are read")

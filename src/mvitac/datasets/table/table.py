@@ -3,6 +3,7 @@
 The table is checked completely before the first image is decoded.
 """
 
+import json
 import math
 import os
 import re
@@ -25,6 +26,7 @@ from mvitac.datasets.table.images import Background, Row, bundles, read_rows
 from mvitac.datasets.table.manifest import Manifest, number_of
 from mvitac.datasets.table.splits import BY_GROUP
 from mvitac.registry import check_range, to_json, unknown
+from mvitac.system.files import parse_json
 
 VERSION = 3  # version of this reader. Increase it when the same table would give another pack.
 MAX_TOGETHER = 1024  # rows of one video that are read in one pass, if their images fit into ``MAX_TOGETHER_BYTES``
@@ -247,6 +249,7 @@ class Rows(Source):
             difference=config.difference,
             crop={m: ", ".join(cuts[c] for c in own if c in cuts) for m, own in asked.items() if {*own} & {*cuts}},
         )
+        parse_json(json.dumps([to_json(self._spec), [*{*groups}]], ensure_ascii=False))  # or no result could be read
 
     def _select(self, table: Manifest) -> tuple[Manifest, list[Background]]:
         """Return the rows that become samples with their images, and the background of each (none for raw images)."""
