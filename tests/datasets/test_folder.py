@@ -372,16 +372,12 @@ def damage_png(path: Path) -> None:
     path.write_bytes(whole)
 
 
-def damage_frames(path: Path) -> None:
-    frames = [Image.new("L", (16, 16), shade) for shade in (0, 255)]
-    frames[0].save(path, "GIF", save_all=True, append_images=frames[1:])
-
-
+BLACK, WHITE = (Image.new("L", (16, 16), shade) for shade in (0, 255))
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "not an image": (lambda path: path.write_text("hello"), "cannot"),
     "truncated": (damage_truncated, "Premature end of JPEG file"),
     "broken png": (damage_png, "cannot"),
-    "animation": (damage_frames, "2 frames"),
+    "animation": (lambda path: BLACK.save(path, "GIF", save_all=True, append_images=[WHITE]), "2 frames"),
     "float": (lambda path: Image.fromarray(np.ones((8, 8), np.float32)).save(path, "TIFF"), "floating-point"),
     "32 bit": (lambda path: Image.fromarray(np.full((8, 8), 70000, np.int32)).save(path, "TIFF"), "not 0 to 65535"),
     "gone": (lambda path: path.unlink(), "No such file"),

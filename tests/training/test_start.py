@@ -46,10 +46,6 @@ def assert_equal_states(a: torch.nn.Module, b: torch.nn.Module) -> None:
     assert first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
 
 
-def differ(a: torch.nn.Module, b: torch.nn.Module) -> bool:
-    return not all(torch.equal(p, q) for p, q in zip(a.parameters(), b.parameters(), strict=True))
-
-
 @pytest.mark.parametrize("keys", ["momentum", "end-to-end"])
 def test_takes_trunks_and_heads_and_copies_them_to_the_keys(pack: Pack, smoke_run: Path, keys: str) -> None:
     config = MViTacConfig(hidden=32, out=16, keys=keys)  # type: ignore[arg-type]
@@ -59,7 +55,8 @@ def test_takes_trunks_and_heads_and_copies_them_to_the_keys(pack: Pack, smoke_ru
     for m in ("vision", "touch"):
         assert_equal_states(method.encoders()[m], source.encoders[m])  # type: ignore[operator]
         assert_equal_states(method.projectors()[m], source.projectors[m])  # type: ignore[operator]
-        assert differ(method.query[m].intra, fresh(smoke(pack), pack.spec, 32).projectors[m])  # type: ignore[index]
+        own, new = method.query[m].intra, fresh(smoke(pack), pack.spec, 32).projectors[m]  # type: ignore[index]
+        assert not all(torch.equal(p, q) for p, q in zip(own.parameters(), new.parameters(), strict=True))
         for key in (module for module in method.key.values() if isinstance(module, Momentum)):  # type: ignore[operator]
             assert_equal_states(key.module, key._query[0])
     assert len(method.key) == (2 if keys == "momentum" else 0)  # type: ignore[arg-type]

@@ -30,11 +30,6 @@ def log_of(run: Path) -> list[dict]:
     return [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
 
 
-def error_of(entry: dict) -> float:
-    """Geometric mean of the errors."""
-    return float(np.exp(np.mean(np.log([max(0.01, 1 - entry["eval"][name]) for name in LINEAR]))))
-
-
 @pytest.fixture(scope="module")
 def run(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Learns fast enough to get better or worse at every evaluation."""
@@ -53,7 +48,8 @@ def test_the_start_is_evaluated_first(pack: Pack, run: Path) -> None:
 
 def test_the_best_weights_are_those_with_the_lowest_errors(pack: Pack, run: Path) -> None:
     evaluations = [entry for entry in log_of(run) if "eval" in entry]
-    errors = [error_of(entry) for entry in evaluations]
+    logs = [[np.log(max(0.01, 1 - entry["eval"][name])) for name in LINEAR] for entry in evaluations]
+    errors = [float(np.exp(np.mean(each))) for each in logs]  # geometric means
     best = evaluations[int(np.argmin(errors))]  # the first of equal ones
     model = mvitac.load(run, which="best")
     assert validate(model, pack, model.run)[0] == pytest.approx(best["eval"], rel=1e-6)

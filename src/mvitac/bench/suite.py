@@ -187,7 +187,10 @@ def open_set(one: SuiteSet, root: Path | None) -> Opened | str:
                 raise unknown(f"task of {one.name}", asked.name, known)
         tasks = tuple((asked, known[asked.name]) for asked in one.tasks)
         packs = _fold(pack, one) if one.folds else (pack,)
-        found = {"rows": _rows_digest(packs, [task for _, task in tasks]), **_image_digests(made)}
+        sides = zip(("", "scored "), made, strict=False)  # before the modalities of the data that is scored
+        files = [(by + name.partition(".")[0], value) for by, each in sides for name, value in each.digests.items()]
+        found = {name: value for name, value in files if not name.endswith("samples")}
+        found["rows"] = _rows_digest(packs, [task for _, task in tasks])
         if pinned(form, found) == "other rows" and form.at:
             why = f"other rows, labels or splits than the suite: digest {found['rows'][:12]}"
             raise ValueError(f"the data of {one.name} ({form.name}) has {why}: get it again, or leave it out")
@@ -239,9 +242,3 @@ def _rows_digest(packs: Sequence[Pack], tasks: Sequence[AnyTask]) -> str:
         for task in tasks
     ]
     return digest([pack.own_ids.tolist(), pack.column("group").astype(str).tolist(), splits, answers])
-
-
-def _image_digests(packs: Sequence[Pack]) -> dict[str, str]:
-    """Digests of the images by modality; of the scored pack with the prefix "scored"."""
-    files = [(by, *item) for by, pack in zip(("", "scored "), packs, strict=False) for item in pack.digests.items()]
-    return {prefix + name.partition(".")[0]: found for prefix, name, found in files if name != "samples.parquet"}
