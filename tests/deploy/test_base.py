@@ -46,7 +46,7 @@ def test_base_is_exported_on_a_few_rows_and_only_if_it_can_be_used(
     monkeypatch.setattr(MaterialsConfig, "open", lambda self, **_: opened.append(self))
     monkeypatch.chdir(tmp_path)
     Image.new("RGB", (32, 32)).save("frame.png")
-    assert main(["predict", "base", "."]) == 2 and "takes vision and touch" in capsys.readouterr().err and not opened
+    assert main(["predict", "base", ".", "--out", "x.csv"]) == 2 and "takes vision and touch" in capsys.readouterr().err and not opened
     model = mvitac.load("base")
     own_data(model, "", few=True)
     assert opened == [replace(model.run.data, num=1000)]
@@ -63,4 +63,4 @@ def test_a_report_of_base_is_not_in_the_package(
 def test_a_probe_of_base_writes_nothing_into_the_package(tmp_path: Path) -> None:
     before = sorted(BASE.iterdir())
     found = mvitac.probe("base", on=toy_pack(tmp_path / "p"), tasks=("bright",), modalities=("touch",), controls=False)
-    assert found["summary"]["bright"]["touch"]["mvitac"]["mean"] > 0.5 and sorted(BASE.iterdir()) == before
+    assert found["summary"]["bright"]["touch"]["base"]["mean"] > 0.5 and sorted(BASE.iterdir()) == before
