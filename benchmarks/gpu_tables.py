@@ -52,14 +52,14 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]], words: int) -> st
 
 def step_table(found: dict[str, Any]) -> str:
     rows = []
-    for batch in ("64", "256", "1024", "4096"):
-        plain, tried = section(found, batch, batch, "step"), section(found, f"{batch} compiled", batch, "compiled")
+    for call, batch in (("64", "64"), ("256", "256"), ("1024", "1024"), ("Lite0, 256", "256")):
+        plain, tried = section(found, call, batch, "step"), section(found, f"{call} compiled", batch, "compiled")
         for name, shown in STEPS.items():
             row = plain.get("variants", {}).get(name) or tried.get("variants", {}).get(name, {})
             lost = name in {**plain.get("lost", {}), **tried.get("lost", {})}
             figures = [number(row.get(key)) for key in ("pairs_per_s", "of_floor", "of_matmul_peak", "over_typical")]
             rows.append(
-                [batch, shown, "not possible" if lost else figures[0], *figures[1:], number(row.get("peak_gib"))]
+                [call, shown, "not possible" if lost else figures[0], *figures[1:], number(row.get("peak_gib"))]
             )
     heads = ["batch", "step", "pairs/s", "share of floor", "share of matrix-product peak", "times typical", "peak GiB"]
     return table(heads, rows, 2)

@@ -84,7 +84,7 @@ def test_every_call_of_speed_is_valid(monkeypatch):
     for options, sizes in asked:
         for section in batches.keys() & set(options.sections):
             batches[section] |= set(sizes)
-    assert batches == {"step": {64, 256, 1024, 4096}, "compiled": {64, 256, 1024, 4096}}
+    assert batches == {"step": {64, 256, 1024}, "compiled": {256}}
 
 
 def test_docs_show_the_figures_that_are_kept():
