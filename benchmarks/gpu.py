@@ -2,9 +2,9 @@
 
     python -m benchmarks.gpu [--minutes 25] [--out FOLDER] [--resume FOLDER] [--commit HASH] [--smoke]
 
-1. Simulated materials at 256 px, as many as fit in three minutes.
-2. Speed (``benchmarks.speed``): the step at batches 64 to 1,024, plain, compiled and with CUDA graphs; input, end to
+1. Speed (``benchmarks.speed``): the step at batches 64 to 1,024, plain, compiled and with CUDA graphs; input, end to
    end, probe, gradient caching.
+2. Simulated materials at 256 px, as many as fit in the time.
 3. Table I from ImageNet (``mvitac compare``): rows of examples/imagenet.toml at 224 px, seed by seed.
 
 ``<out>/gpu.json`` has all figures. It is written after each part, and what is in it is not measured again.
@@ -72,10 +72,10 @@ class Size:
     """Rows of examples/imagenet.toml, in the order in which they are trained."""
     speed: tuple[tuple[str, str], ...] = (
         ("256", "--batch 256 --rounds 5 --sections step input whole"),
-        ("64", "--batch 64 --rounds 5 --sections step"),
-        ("1024", "--batch 1024 --rounds 3 --sections step"),
         ("Lite0, 256", "--trunk tf_efficientnet_lite0 --batch 256 --rounds 5 --sections step"),
+        ("1024", "--batch 1024 --rounds 3 --sections step"),
         ("256 compiled", "--batch 256 --rounds 5 --sections compiled"),
+        ("64", "--batch 64 --rounds 5 --sections step"),
         ("caching", "--sections caching probe"),
     )
     """Name and options of each call of ``benchmarks.speed``."""
@@ -223,7 +223,7 @@ def measure_speed(session: Session) -> None:
         known = session.found["speed"].get(name, {})
         if known.get("finished"):
             continue
-        if session.left() < 60:
+        if session.left() < 20:
             return
         session.say(f"speed, {name}")
         file = session.work / f"speed-{name.replace(' ', '-')}.json"
@@ -237,8 +237,11 @@ def measure_speed(session: Session) -> None:
         session.save()
 
 
-def compare_methods(session: Session, data: list[str]) -> None:
+def compare_methods(session: Session) -> None:
     """Train and score the rows of Table I, seed by seed, and make the table of what is finished."""
+    if session.left() < TABLE_SECONDS + session.size.data_seconds:
+        return
+    data = make_data(session)
     folder, archive = session.work / "table", session.out / "runs.tar.gz"
     if archive.exists() and not folder.exists():
         with tarfile.open(archive) as tar:
@@ -318,9 +321,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--smoke", action="store_true", help="a rehearsal in seconds")
     session = Session(parser.parse_args(argv))
     session.save()
-    data = make_data(session)
     measure_speed(session)
-    compare_methods(session, data)
+    compare_methods(session)
     session.save()
     session.say(f"written: {session.out}/gpu.json; the same command continues")
 

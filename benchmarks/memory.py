@@ -42,7 +42,7 @@ def main() -> None:
         generator = torch.Generator().manual_seed(number)
         view = partial(random_view, raw, ViewAugment(), given["size"], generator, torch.bfloat16)
         images = {m: [view(), view()] for m in ("vision", "touch")}
-        return Views(images=images, labels={}, rows=torch.arange(part))
+        return Views(images=images, labels={}, rows=torch.arange(part, device=device))
 
     parts = [partial(views, number) for number in range(batch // part)]
     before = peak_resident()

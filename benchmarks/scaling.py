@@ -36,7 +36,9 @@ def main() -> None:
     )
     shape = (options.batch, 3, options.size, options.size)
     images = [torch.randn(shape, device=device).to(torch.bfloat16, memory_format=torch.channels_last) for _ in range(4)]
-    batch = Views(images={"vision": images[:2], "touch": images[2:]}, labels={}, rows=torch.arange(options.batch))
+    batch = Views(
+        images={"vision": images[:2], "touch": images[2:]}, labels={}, rows=torch.arange(options.batch, device=device)
+    )
     variants = {}
     for name, size in (("alone", World()), ("together", world)):
         run = replace(our_run(scale, "bf16"), batch_size=options.batch * size.size)

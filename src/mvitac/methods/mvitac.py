@@ -219,7 +219,7 @@ def embed(name: str, towers: nn.ModuleDict, batch: Views, views: slice) -> Embed
         return z
 
     branches = [partial(of, modality) for modality, _ in present(towers, batch)]
-    given = any(images[0].ndim == 2 for images in batch.images.values())
-    if batch.rows.device.type != "cpu" or draws_random_numbers(towers) or given:
+    first = [images[0] for images in batch.images.values()]
+    if any(x.device.type != "cpu" or x.ndim == 2 for x in first) or draws_random_numbers(towers):
         return {key: tensor for branch in branches for key, tensor in branch().items()}
     return in_branches(branches)
