@@ -10,7 +10,6 @@
 ``<out>/gpu.json`` has all figures. It is written after each part, and what is in it is not measured again.
 ``<out>/runs.tar.gz`` has the small files of finished runs. Both together continue on another machine (``--resume``). A
 part that is cut off by the time limit starts again; a run of Table I continues from its checkpoint on the same machine.
-``python -m benchmarks.gpu_tables <out>/gpu.json`` writes the figures into the documentation.
 """
 
 from __future__ import annotations
@@ -311,7 +310,7 @@ def table(folder: Path) -> dict[str, Any]:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Measure on one GPU, within a time limit.")
     parser.add_argument("--minutes", type=float, default=25, help="time limit of this call; default 25")
     parser.add_argument("--out", type=Path, default=Path("runs/gpu"), help="folder of the figures; default runs/gpu")
     parser.add_argument("--work", type=Path, default=Path("runs/gpu-work"), help="folder of data and weights")

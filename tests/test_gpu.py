@@ -1,4 +1,4 @@
-"""benchmarks/gpu.sh: a rehearsal on a CPU, its time limit, and the tables that it fills."""
+"""benchmarks/gpu.sh: a rehearsal on a CPU, and its time limit."""
 
 import json
 import shlex
@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 import pytest
-from benchmarks import gpu, gpu_tables, speed
+from benchmarks import gpu, speed
 
 from mvitac.cli.main import main as mvitac
 
@@ -85,9 +85,3 @@ def test_every_call_of_speed_is_valid(monkeypatch):
         for section in batches.keys() & set(options.sections):
             batches[section] |= set(sizes)
     assert batches == {"step": {64, 256, 1024}, "compiled": {256}}
-
-
-def test_docs_show_the_figures_that_are_kept():
-    found = json.loads(gpu_tables.KEPT.read_text()) if gpu_tables.KEPT.exists() else {}
-    for page, names in gpu_tables.PAGES.items():
-        assert page.read_text() == gpu_tables.filled(page.read_text(), names, found), "python -m benchmarks.gpu_tables"

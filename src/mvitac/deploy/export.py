@@ -37,12 +37,7 @@ for some images only)."""
 
 
 def export(
-    model: Model,
-    pack: Pack,
-    out: Path,
-    config: ExportConfig = ExportConfig(),
-    *,
-    new: Pack | None = None,
+    model: Model, pack: Pack, out: Path, config: ExportConfig = ExportConfig(), *, new: Pack | None = None
 ) -> dict[str, Any]:
     """Write ``model`` with its probes as ONNX into the new folder ``out``, checked on test rows of ``pack``.
 

@@ -108,12 +108,7 @@ class ExternalModel(Model):
     """
 
     def __init__(
-        self,
-        text: str,
-        part: ExternalEncoder,
-        spec: DataSpec = PICTURES,
-        stored: int = 0,
-        notes: tuple[str, ...] = (),
+        self, text: str, part: ExternalEncoder, spec: DataSpec = PICTURES, stored: int = 0, notes: tuple[str, ...] = ()
     ) -> None:
         nn.Module.__init__(self)
         self.text, self.spec, self.notes, self.name = text, spec, notes, part.loaded.title

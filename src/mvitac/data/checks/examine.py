@@ -91,13 +91,7 @@ def examine_pack(pack: str | Path | Pack, draw: Draw | None = None) -> list[Find
 
 
 def examine_source(
-    source: Source,
-    *,
-    num: int = 0,
-    size: int = 64,
-    workers: int = 1,
-    quiet: bool = False,
-    draw: Draw | None = None,
+    source: Source, *, num: int = 0, size: int = 64, workers: int = 1, quiet: bool = False, draw: Draw | None = None
 ) -> list[Finding]:
     """Findings about ``source``, which is read into a temporary pack of ``size`` px, to ``draw`` while it is there.
 

@@ -51,11 +51,7 @@ class Manifest:
 
     @classmethod
     def of(
-        cls,
-        path: Path,
-        rows: Sequence[Row],
-        images: dict[str, list[ImageRef | None]] | None = None,
-        **known: Any,
+        cls, path: Path, rows: Sequence[Row], images: dict[str, list[ImageRef | None]] | None = None, **known: Any
     ) -> "Manifest":
         """Return the table of ``rows`` that a reader made from ``path``; cells that a row lacks are empty.
 

@@ -210,13 +210,7 @@ class Rows(Source):
         asked = {"vision": self._images[: bool(self._vision)], "touch": self._touch}
         missing = images.check_present(table, asked, config.allow_missing)
         stamps = images.check_files(table, self._images, grounds)
-        if self._group:
-            group_by, groups = self._group, table.filled(self._group, "group")
-        else:
-            group_by, groups = splits.group_by_video(table.root, table.numbers, [table.images[c] for c in self._images])
-        touch_groups = table.filled(config.touch_group, "touch_group") if config.touch_group else groups
-        if not config.touch_group and table.group not in (None, self._group):
-            touch_groups = [f"{g}/{row[table.group]}" for g, row in zip(groups, table.rows, strict=True)]
+        group_by, groups, touch_groups = self._groups(table)
         counts = all_hold(config.label_only, table)
         read = [columns.read_task(table, column, counts) for column in label_columns]
         values, measured = columns.read_values(table, value_tasks, counts)
@@ -251,6 +245,18 @@ class Rows(Source):
         )
         parse_json(json.dumps([to_json(self._spec), [*{*groups}]], ensure_ascii=False))  # or no result could be read
 
+    def _groups(self, table: Manifest) -> tuple[str, list[str], list[str]]:
+        """Return what groups the rows, and each row's group and touch group."""
+        if self._group:
+            group_by, groups = self._group, table.filled(self._group, "group")
+        else:
+            group_by, groups = splits.group_by_video(table.root, table.numbers, [table.images[c] for c in self._images])
+        if self._config.touch_group:
+            return group_by, groups, table.filled(self._config.touch_group, "touch_group")
+        if table.group in (None, self._group):
+            return group_by, groups, groups
+        return group_by, groups, [f"{g}/{row[table.group]}" for g, row in zip(groups, table.rows, strict=True)]
+
     def _select(self, table: Manifest) -> tuple[Manifest, list[Background]]:
         """Return the rows that become samples with their images, and the background of each (none for raw images)."""
         config, grounds = self._config, self._config.background or ("background",)
@@ -275,11 +281,7 @@ class Rows(Source):
         return table.kept(kept, f"every row meets {' and '.join(config.no_contact)}"), found
 
     def _assign(
-        self,
-        table: Manifest,
-        whole: dict[str, list[str]],
-        tasks: Sequence[AnyTask],
-        labels: Sequence[Sequence[int]],
+        self, table: Manifest, whole: dict[str, list[str]], tasks: Sequence[AnyTask], labels: Sequence[Sequence[int]]
     ) -> list[str]:
         """Return the split of each row, from its column or assigned by group; those of one ``whole`` are in one."""
         config, column, where = self._config, self._split, str(table.path)
