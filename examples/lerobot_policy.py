@@ -176,6 +176,8 @@ def main() -> None:
     encoder = ObservationEncoder(mvitac.load(options.model), {GEL: "touch"}, tune=options.touch == "tuned")
     eyes = Eyes(encoder, options.touch, pack.images["touch"])
     values = {task.name: pack.values(task) for task in pack.spec.values}
+    if not {"action", "state"} <= {*values}:
+        raise SystemExit(f"{pack.path} lacks values named action and state: pack them with --values")
     numbers = {STATE: values["state"], ACTION: values["action"]}
     episodes = read_episodes(pack)
     held_out = [number for number, rows in enumerate(episodes.rows) if pack.column("split")[rows[0]] == "test"]

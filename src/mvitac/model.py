@@ -296,7 +296,9 @@ class Model(nn.Module):
     def open_data(self, *, quiet: bool = False) -> Pack:
         """Open the data that the model was trained on; ValueError if it is not here, or ``foreign`` names its place."""
         if self.foreign and self.run.data.names_a_place:
-            raise ValueError("an artifact may be a stranger's: its data's place is not opened, name a pack (--on PACK)")
+            raise ValueError(
+                "an artifact may be a stranger's, so its data's place is not opened: name a pack, --on PACK"
+            )
         return self.run.data.open(quiet=quiet)
 
     def weights_digest(self) -> str:
@@ -349,6 +351,8 @@ def load(path: str | Path, which: Which = "last") -> Model:
     file = weights_file(path, which) if path.is_dir() else path
     if not file.is_file():
         hint = "; the run is not finished: `mvitac pretrain --resume`" if (path / "checkpoint.pt").exists() else ""
+        if inside := sorted(file.parent for file in path.glob("*/model.safetensors")):
+            hint = f"; there is one at {inside[0]}"
         raise ValueError(f"no trained model at {file}{hint}")
     header, tensors = read_model(file, ABOUT)
     try:

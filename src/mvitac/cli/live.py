@@ -128,7 +128,7 @@ def _run(loop: Live, seconds: float | None) -> None:
             news.wait(0.05)
             news.clear()
             if said := loop.step():
-                print(json.dumps({"time": round(loop.clock() - start, 4), **said}), flush=True)
+                print(_brief({"time": loop.clock() - start, **said}), flush=True)
     except KeyboardInterrupt:
         _say("stopped")
     finally:
@@ -137,6 +137,11 @@ def _run(loop: Live, seconds: float | None) -> None:
         for thread in threads:
             thread.join(2.0)  # a device that hangs must not hang us
     loop.finish()
+
+
+def _brief(said: dict[str, Any]) -> str:
+    """JSON of ``said`` in one line, numbers with six digits."""
+    return json.dumps(json.loads(json.dumps(said), parse_float=lambda text: float(f"{float(text):.6g}")))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -95,6 +95,8 @@ def find(argv: list[str]) -> None:
         raise ValueError("name the picture to search for: mvitac find IMAGE --model M --known FILE")
     check_json(options.json)
     check_json(options.sheet, "--sheet")
+    if not options.known.is_file():
+        raise ValueError(f"no file {options.known}: write it with mvitac embed")
     model = load(options.model)
     known = Embeddings(options.known, model.weights_digest())
     target = options.target or next((m for m in model.encoders if m != options.source), options.source)
@@ -123,6 +125,7 @@ def find(argv: list[str]) -> None:
         blocks = [("query", [(query, "")]), ("found", tiles)]
         sheet = draw(title, [(name, [(side_by_side(fit(x, _SIDE)), t) for x, t in some]) for name, some in blocks])
         write_atomic(options.sheet, lambda file: sheet.save(file, "PNG"))
+        print(f"written: {options.sheet}", file=printed_to(options.json))
 
 
 def _picture(files: Sequence[Path]) -> np.ndarray:
