@@ -146,6 +146,7 @@ WORDS: list[tuple[str, str, str]] = [
     ("probe {run} ", "--tasks patern", "did you mean 'pattern'"),
     ("probe {run} ", "--on {run}", "pack.json"),
     ("probe ", "{pack}", "no trained model"),
+    ("find x.png --model {run} ", "--known x.parquet", "x.parquet: write it"),
     (PACKED, "--values text:N", "'hard'"),
     (PACKED, "--values united:N", "'3.2 mN'"),
     (PACKED, "--values endless:N", "'inf'"),

@@ -74,6 +74,10 @@ def test_the_hub_offline_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.M
     (tmp_path / "runs").mkdir()
     with pytest.raises(ValueError, match="no trained model at"):  # a slip in a local path does not ask the Hub
         mvitac.load("runs/frist")
+    (tmp_path / "runs/tuned/seed0").mkdir(parents=True)
+    (tmp_path / "runs/tuned/seed0/model.safetensors").touch()
+    with pytest.raises(ValueError, match="there is one at runs/tuned/seed0"):
+        mvitac.load("runs/tuned")
 
 
 def test_a_download_is_an_artifact_and_no_other_file_is_asked_for(
