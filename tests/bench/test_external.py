@@ -230,6 +230,8 @@ def test_an_encoder_is_probed_beside_a_run(smoke_run: Path, pack: Pack) -> None:
     assert [r for r in result["records"] if "run" in r] == alone["records"]  # the run's scores are those without it
     for bad, words in (
         ({"encoders": [TINY, TINY]}, "given twice"),
+        ({"encoders": [TINY + ",title=mvitac"]}, "two rows would be called 'mvitac'"),
+        ({"encoders": [TINY + ",title=pixels"]}, "two rows would be called 'pixels'"),
         ({"encoders": ["external:timm/test_resnet,weights=none.pth"]}, "a file that exists"),
     ):
         with pytest.raises(ValueError, match=words):

@@ -304,12 +304,11 @@ def verdict(sense: str, rows: Sequence[Mapping[str, Any]]) -> str:
 
 def report(result: Mapping[str, Any]) -> str:
     """The result as text."""
-    head = ["replaced", "by", "change of action", "change of error", "p", *result["rows"][0]["parts"]]
-    lines = []
-    for row in result["rows"]:
-        change, worse = (f"{v[0]:.2f} [{v[1]:.2f}, {v[2]:.2f}]" for v in (row["change"], row["error"]))
-        parts = [f"{value[0]:+.2f}" for value in row["parts"].values()]
-        lines.append([row["sense"], row["kind"], change, worse, f"{row['error'][3]:.2g}", *parts])
-    error = "{:.2f} [{:.2f}, {:.2f}]".format(*result["error"])
-    about = f"{result['episodes']} episodes, error {error}, in {result['unit']}"
-    return "\n".join([about, tabulate(lines, head, disable_numparse=True), *result["verdicts"].values()])
+    rows, text = result["rows"], "{0:.2f} [{1:.2f}, {2:.2f}]".format
+    lines = [[r["sense"], r["kind"], text(*r["change"]), text(*r["error"]), f"{r['error'][3]:.2g}"] for r in rows]
+    about = [f"{result['episodes']} episodes, error {text(*result['error'])}, in {result['unit']}"]
+    about += [tabulate(lines, ["replaced", "by", "change of action", "change of error", "p"], disable_numparse=True)]
+    if of := [*rows[0]["parts"]]:
+        parts = [[r["sense"], r["kind"], *(f"{v[0]:+.2f}" for v in r["parts"].values())] for r in rows]
+        about += ["Change of error in parts:", tabulate(parts, ["replaced", "by", *of], disable_numparse=True)]
+    return "\n".join([*about, *result["verdicts"].values()])

@@ -11,7 +11,7 @@ from mvitac.data.several import JoinedPack
 from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
-from mvitac.evaluation.controls import Records, controls_of, frozen_trunks
+from mvitac.evaluation.controls import CONTROLS, Records, controls_of, frozen_trunks
 from mvitac.evaluation.encoders import Bound, open_encoders, probe_encoders
 from mvitac.evaluation.features import fitting
 from mvitac.evaluation.folds import fold_splits
@@ -90,6 +90,7 @@ def probe_runs(
     names = [name + ", best" * (weights == "best") for name in names_of(paths, models)]
     pack = _common_pack(models, pack)
     tasks, modalities = chosen(pack, session)
+    _check_names({*names}, {model.title for model, _ in others}, {*CONTROLS, *pack.spec.controls})
     for model in models:
         fitting(model, pack)
     # The initial weights that an artifact names may be any file or download.
@@ -119,6 +120,13 @@ def probe_runs(
         name = "probe" + ".best" * (weights == "best") + ".folds" * bool(session.folds)
         write_json(path / f"{name}.json", result, sealed=True)
     return result
+
+
+def _check_names(runs: set[str], encoders: set[str], controls: set[str]) -> None:
+    if alike := encoders & runs | (encoders | runs) & controls:
+        raise ValueError(
+            f"two rows would be called {min(alike)!r}: give a title=NAME, or pack with another control's name"
+        )
 
 
 def _check_paths(paths: Sequence[Path], encoders: Sequence[str]) -> None:

@@ -69,14 +69,13 @@ class Finetuning:
     seeds: int = 1
     """Number of seeds. Each draws its own groups, batches and views."""
     from_scratch: bool = True
-    """Also train all of the same network from random weights with the same labels, its settings chosen alike.
-    --no-from-scratch leaves it out."""
+    """Whether all of the same network is also trained from random weights with the same labels, settings chosen alike."""
     allow_leak: bool = False
     """Go on if the model, or one it started from, was trained on test rows or groups. LEAK stands beside every score."""
 
     def __post_init__(self) -> None:
-        if not (self.lr and self.steps and self.fractions and self.seeds > 0):
-            raise ValueError("give at least one of lr, steps, fractions and seeds")
+        if not (self.lr and self.steps and self.fractions and self.seeds > 0 and self.batch_size > 1):
+            raise ValueError("give at least one of lr, steps, fractions and seeds, and a batch size of 2 or more")
 
 
 def finetune(
@@ -242,7 +241,7 @@ def _fraction(job: _Job, percent: float, sources: list[Source] | None) -> tuple[
         for kind in job.kinds:
             path = job.folder(percent, kind) / f"seed{seed}"
             run = job.run_of(percent, seed, kind, settings[kind])
-            job.say(f"{percent:g} %: {kind}, seed {seed}, {run.steps} steps of {run.batch_size}")
+            job.say(f"{percent:g} %: {kind}, seed {seed}, {run.steps} steps of {run.batch_size}, lr {run.optim.lr:g}")
             more: dict[str, Any] = {"loggers": (job.forecast,), "validate": False}  # all groups are learned from
             train(run, path, resume=True, quiet=job.quiet, pack=job.pack, **more)
             own = own_heads(load(path), job.pack, job.tasks, [job.modality])
