@@ -157,15 +157,31 @@ def tactip_pairs(folder: Path, out: Path) -> None:
 
     ``sim``, the depth image of the same pose, is left out: it is nearly the answer. Every tap is independent.
     """
+    rows = [{name: value for name, value in row.items() if name != "vision"} for row in _taps(folder, "tap")]
+    write(rows, out / "tactip_pairs.csv", folder, ("touch",))
+
+
+def tactip_depth(folder: Path, out: Path) -> None:
+    """The same taps, and those with shear without values, with ``sim`` as vision: to pre-train on, not to probe vision."""
+    sheared = [
+        row | dict.fromkeys([name for name in row if name[:4] in ("surf", "edge")], "")
+        for row in _taps(folder, "shear")
+    ]
+    write(_taps(folder, "tap") + sheared, out / "tactip_depth.csv", folder, ("touch", "vision"))
+
+
+def _taps(folder: Path, motion: str) -> list[dict[str, str]]:
     rows = []
-    for i, row in enumerate(row for row in read(folder / "manifest.csv") if row["motion"] == "tap"):
+    for i, row in enumerate(row for row in read(folder / "manifest.csv") if row["motion"] == motion):
         angle, on_edge = np.deg2rad(float(row["Rz_deg"])), row["surface"] == "edge_2d"
         surface = {f"surface_{name}": row[name] for name in ("z_mm", "Rx_deg", "Ry_deg")}
         edge = {f"edge_{name}": row[name] for name in ("y_mm", "z_mm")}
         edge |= {"edge_sine": f"{np.sin(angle):.6f}", "edge_cosine": f"{np.cos(angle):.6f}"}
         about = {"touch": row["real"], "split": row["split"], "block": f"{row['surface']}-{row['split']}-{i // 10:04d}"}
-        rows.append(about | surface | edge | dict.fromkeys(surface if on_edge else edge, ""))
-    write(rows, out / "tactip_pairs.csv", folder, ("touch",))
+        about["block"] += "-shear" * (motion == "shear")
+        asked = surface | edge | dict.fromkeys(surface if on_edge else edge, "")
+        rows.append(about | asked | {"vision": row["sim"]})
+    return rows
 
 
 def tactip_rigs(folder: Path, out: Path) -> None:
@@ -187,7 +203,7 @@ def tactip_rigs(folder: Path, out: Path) -> None:
 MANIFESTS = {
     make: make.__name__ for make in (slip_grasp, slip_gsmini, physiclear, vt60, wedge_force, tactip_shear, tactip_pairs)
 }
-MANIFESTS |= {wedge_force_pairs: "wedge_force", tactip_rigs: "tactip_shear"}
+MANIFESTS |= {wedge_force_pairs: "wedge_force", tactip_rigs: "tactip_shear", tactip_depth: "tactip_pairs"}
 """What makes a manifest -> the dataset's folder."""
 
 if __name__ == "__main__":

@@ -31,10 +31,9 @@ def authors(data: DatasetConfig, phased: bool) -> Run:
 
     Differences from `paper`: lr 1e-3 with weight decay 1e-6 and StepLR, which first decays at epoch 20; wide heads with
     dropout; a random first convolution for stacked gels; flips with an effective probability of 25 %; grayscale also for
-    grasping; whole images are probed at 256 px. Not repeated: other views of
-    the second gel of a stacked image, key heads that are never updated, key towers that do not start as copies of the query
-    towers, the last short batch of an epoch, and the choice of a checkpoint: here the last epoch is kept; the authors also
-    keep, of every tenth epoch, the one with the best accuracy on its last training batch.
+    grasping; whole images are probed at 256 px. Not repeated: other views of the second gel of a stacked image, key heads
+    that are never updated, key towers that do not start as copies of the query towers, the last short batch of an epoch, and
+    the choice of a checkpoint by its last training batch: here the last epoch is kept.
     """
     views = ViewAugment(flip=0.25, grayscale=0.2)
     base = paper(data, phased)
@@ -49,10 +48,9 @@ def authors(data: DatasetConfig, phased: bool) -> Run:
 
 
 def modern(data: DatasetConfig, phased: bool) -> Run:
-    """Current practice. The list gives the reason and the measured effect of each change.
+    """Current practice. The list gives the reason and the measured effect of each change, in points of accuracy.
 
     Unless noted, effects are measured in 300 steps of `quick`'s networks with momentum keys (docs/results/ablation.md).
-    "No difference" means a difference within the noise. Points are percentage points of accuracy.
 
     - End-to-end keys: gradients through both views instead of a momentum tower, as in SimCLR, and inter-modal losses on all
       pairs of views. With all steps of `quick`: 11 points of category, 12 of rough, and almost twice the retrieval score
@@ -60,19 +58,13 @@ def modern(data: DatasetConfig, phased: bool) -> Run:
     - No flips of touch, which no real press shows: 4 points of category with all steps of `quick`.
     - AdamW with lr 1e-3, warm-up and cosine schedule (MoCo v3): Adam at a constant .03 destroys the ImageNet weights. Also
       from scratch, 8 points of category (one seed). Biases and BatchNorm are not decayed.
-    - BatchNorm in the heads (SimCLR v2, MoCo v3): prevents an early collapse of the embeddings with small batches. No
-      difference (three seeds: without it +.9).
-    - Rows of a touch are spread over the epoch: consecutive frames of one touch are near-duplicates and wrong as negatives.
-      No difference on simulated touches, which have no consecutive frames (one seed).
+    - BatchNorm in the heads (SimCLR v2, MoCo v3) against an early collapse with small batches: no difference (three seeds).
+    - Rows of a touch are spread over the epoch: consecutive frames are near-duplicates and wrong as negatives. No
+      difference on simulated touches, which have no consecutive frames (one seed).
     - same-touch positives: two views of one image share lamp, background and sensor, which is enough to minimise L_vv and
-      L_tt without the material (docs/simulator.md). Another press of the same instance shares only the object. The largest
-      effect: with momentum keys and all steps of `quick` 19 points of category, 7 of soft, 13 of rough. A neighbouring
-      moment, as in Touch and Go, gains 3 points where another press gains 10 (300 steps, one seed). Not used for grasps:
-      their rows differ in the phase (before, during, after), and the phases differ in the contact itself.
-    - All four losses, also with same-image positives: on simulated grasps, training without the intra-modal losses gains 5.7
-      points (docs/results/grasps.md). This was seen on test data and is not adopted until another dataset confirms it.
-    - bf16 where the hardware computes it, else fp32 (precision auto): where torch emulates bf16, a step takes ten times as
-      long or more. Their scores do not differ (three seeds, docs/speed.md).
+      L_tt without the material. Another press of the same instance shares only the object: with momentum keys and all steps
+      of `quick` 19 points of category, 7 of soft, 13 of rough. Not used for grasps, whose phases differ in the contact.
+    - bf16 where the hardware computes it: emulated, it takes ten times as long. Scores do not differ (docs/speed.md).
     """
     base = paper(data, phased)
     return replace(
@@ -94,13 +86,11 @@ def quick(data: DatasetConfig, phased: bool) -> Run:
 
     `mvitac demo` trains it where ImageNet's weights are missing: 8 to 17 minutes on two cores without fast bf16.
 
-    - ResNet-10 (timm's resnet10t) at 48 px: more steps in the same time. Its score was not compared with ResNet-18's.
+    - ResNet-10 (timm's resnet10t) at 48 px: more steps in the same time. Crops show whole images at the scale of 72 px.
     - Batch 32, the number of steps and temperature .2 were chosen on split val, seed 0, never on test (docs/simulator.md).
-    - Whole images are probed at 72 px, because crops show them at that scale during training.
     - Crops of at least 40 % of the area, no grayscale, lr 1.4e-3: easier views for few steps.
     - one-per-touch batches: all touch groups of simulated materials have the same size.
-    - Momentum .9 for methods that have one (``with_method``): with .99 the keys would average over more steps than a short
-      run has.
+    - Momentum .9 for methods that have one (``with_method``): .99 would average over more steps than a short run has.
     """
     base = modern(data, phased)
     views = ViewAugment(scale=(0.4, 1.0), grayscale=0.0)

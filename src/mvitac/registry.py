@@ -133,11 +133,10 @@ def _dataclass_from_json(cls: type, given: dict[str, Any], where: str) -> Any:
     for key in given:
         if key not in names:
             raise unknown(f"field in {where}", key, names)
-    values = {key: from_json(hints[key], v, f"{where}.{key}") for key, v in given.items()}
-    try:
-        return cls(**values)
-    except TypeError as error:  # which names the fields that are missing
-        raise ValueError(f"{where}: {error}") from None
+    none, required = dataclasses.MISSING, [f for f in dataclasses.fields(cls) if f.name not in given]  # type: ignore[arg-type]
+    if missing := [f.name for f in required if f.default is none and f.default_factory is none]:
+        raise ValueError(f"{where}: give {', '.join(missing)}, too")
+    return cls(**{key: from_json(hints[key], v, f"{where}.{key}") for key, v in given.items()})
 
 
 def _scalar_from_json(annotation: Any, value: Any, where: str) -> Any:

@@ -64,9 +64,10 @@ def done(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, di
 @pytest.mark.parametrize("name", PLANS)
 @pytest.mark.parametrize("recipe_name", RECIPES)
 def test_every_row_of_every_plan_is_a_run(name: str, recipe_name: str) -> None:
-    plan = replace(find_plan(name), recipe=recipe_name)
+    plan = replace(find_plan(name), recipe=recipe_name, set={"method": {"temperature": 0.3}})
     for row in plan.rows:
         run = plan.run(row, MaterialsConfig(), 7)
+        assert getattr(run.method, "temperature", 0.3) == row.set.get("method.temperature", 0.3)
         assert run.seed == 7 and run.method.name == row.method
         for field, value in row.set.items():
             found: object = run
@@ -106,8 +107,14 @@ def test_rows_the_data_does_not_allow_are_told(tmp_path: Path) -> None:
         assert "the same run as 'MViTac'" in work.left_out[label]
     assert "the same run as 'no flips'" in work.left_out["no touch flips"]
     assert "lacks a modality" in work.left_out["losses vv"]
-    with pytest.raises(ValueError, match="no row that this data allows"):
-        lay_out(small(pack, rows=(Row(label="MViTac", method="cmc"),)), pack, tmp_path / "out", ProbeConfig())
+    for method, wrong, words in (
+        ("cmc", {}, "no row that"),
+        ("moc", {}, "unknown"),
+        ("moco", {"method.tau": 1}, "unknown"),
+    ):
+        plan = small(pack, rows=(Row(label="MViTac", method=method, set=wrong),))
+        with pytest.raises(ValueError, match=words):
+            lay_out(plan, pack, tmp_path / "out", ProbeConfig())
 
 
 def test_a_row_may_read_the_same_samples_in_another_way(pack: Pack, tmp_path: Path) -> None:
@@ -160,6 +167,7 @@ def test_methods_of_these_plans_see_equally_many_images(pack: Pack, name: str) -
     ("text", "says"),
     [
         ("rows = [", "not valid TOML"),
+        ("[[rows]]", "plan.rows: give label, too"),
         ('[[rows]]\nlabel = "a"', "unknown reference row 'MViTac'"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\ntau = 1', "unknown field in plan.rows 'tau'"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\n[[rows]]\nlabel = "A"', "two labels are one"),

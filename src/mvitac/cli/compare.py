@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 from mvitac.cli.options import parse, selectors
@@ -91,7 +92,8 @@ def compare(argv: list[str]) -> None:
         do_all(work)
     with hold_lock(options.out / "tables", "waiting for the tables of another process", wait=True):
         written = write_tables(gather_folds(plan, works, options.out, config), options.out)
-    print(written[0].read_text(), *(f"written: {path}" for path in written), sep="\n")
+    text = [line if line.startswith("|") else fill(line, 80) for line in written[0].read_text().splitlines()]
+    print(*text, "", *(f"written: {path}" for path in written), sep="\n")
 
 
 def _parse(chosen: dict[str, str], rest: list[str], plan: Plan) -> _Options:

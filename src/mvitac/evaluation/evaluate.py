@@ -47,11 +47,7 @@ def probe(
         allow_leak: Score also test rows of ``on`` that a run was trained on.
         options: Fields of ``ProbeConfig``: probes, tasks, modalities, controls, fractions, folds.
 
-    Returns:
-        The scores (see ``probe_runs``).
-
-    Raises:
-        ValueError: As ``probe_runs``.
+    Returns what ``probe_runs`` returns, and raises what it raises.
 
     Examples:
         >>> scores = mvitac.probe("runs/demo/seed0", probes=("linear", "knn"))  # doctest: +SKIP

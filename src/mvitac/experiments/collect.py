@@ -48,6 +48,8 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str
     for row in plan.rows:
         if row.label in pack.spec.controls:
             raise ValueError(f"row {row.label!r} has the name of a control of this data: give it another label")
+        own_set = {name: value for name, value in row.set.items() if not name.startswith("data.")}
+        plan.run(replace(row, set=own_set), plan.data, 0, pack.phased)  # a mistake in the plan, not a row to leave out
         try:
             own, key = _check_row(plan, row, pack)
         except ValueError as error:

@@ -1,7 +1,7 @@
 """The description of a comparison: rows, tasks, probes, seeds. Plans that ship with the package are in ``plans/``."""
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -10,8 +10,9 @@ from mvitac.data.spec import MODALITIES
 from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.probe_config import Probe
+from mvitac.methods.base import MethodConfig
 from mvitac.recipes import recipe, with_method
-from mvitac.registry import from_json, to_json, unknown
+from mvitac.registry import default, from_json, to_json, unknown
 from mvitac.run import Run
 from mvitac.system.files import brief, parse_json
 
@@ -113,7 +114,10 @@ class Plan:
         """
         try:
             base = with_method(recipe(row.recipe or self.recipe, data, phased), row.method)
-            return replace(changed(base, {**self.set, **row.set}), seed=seed)
+            known = {f"method.{name}" for each in self.rows for name in vars(default(MethodConfig, each.method))}
+            lacked = known - {f"method.{name}" for name in vars(base.method)}  # --set means those that have the field
+            shared = {name: value for name, value in dotted(self.set) if ".".join(name.split(".")[:2]) not in lacked}
+            return replace(changed(base, {**shared, **row.set}), seed=seed)
         except ValueError as error:
             raise ValueError(f"row {row.label!r}: {error}") from None
 
@@ -140,10 +144,17 @@ def slug(label: str) -> str:
     return "-".join("".join(c if c.isalnum() or c in ".=" else " " for c in label.lower()).split())
 
 
+def dotted(changes: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Names and values of ``changes``; a table in a table, as TOML reads an unquoted a.b, is a dotted name."""
+    for name, value in changes.items():
+        inner = {f"{name}.{key}": v for key, v in value.items()} if isinstance(value, dict) else {}
+        yield from dotted(inner) if inner else [(name, value)]
+
+
 def changed(run: Run, changes: Mapping[str, Any]) -> Run:
     """``run`` with fields changed by dotted name; values as in JSON."""
     value, whole = to_json(run), {}
-    for name, new in changes.items():
+    for name, new in dotted(changes):
         both = name.startswith("encoder.") and name.count(".") == 1  # short for both modalities
         names = [name.replace(".", f".{m}.") for m in MODALITIES] if both else ["init.path" if name == "init" else name]
         whole |= dict.fromkeys(names, new)
@@ -165,6 +176,6 @@ def setting(text: str, what: str = "--set") -> tuple[str, Any]:
         example = "split=fold1" if what == "fold" else "steps=100 or method.temperature=0.2"
         raise ValueError(f"{what} {text}: give field=value, e.g. {example}")
     try:
-        return name, parse_json(value)
+        return name, parse_json(f"0{value}" if value.startswith(".") else value)
     except ValueError:
         return name, value

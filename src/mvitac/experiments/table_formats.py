@@ -125,7 +125,7 @@ def _significance(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> 
     if all((cell["difference"] or [None])[-1] is None for line in lines for cell in line.cells.values()):
         return f"Differences to {plan.reference} have no p, which needs several seeds."
     groups = {record["task"]: num_groups_of(record) for record in result["records"]}
-    least = ", ".join(f"{task} {_p(least_p(num))} ({num} {result['group_by']}s)" for task, num in groups.items())
+    least = ", ".join(f"{task} {_p(least_p(num))} ({result['group_by']}s: {num})" for task, num in groups.items())
     return (
         f"p is of the difference to {plan.reference} on the same test rows, where both have several seeds, not corrected"
         f" for the number of rows. Smallest possible p: {least}."
