@@ -13,7 +13,7 @@ from PIL import Image
 from torch.utils.data import DataLoader
 
 import mvitac
-from mvitac.data.images import difference
+from mvitac.data.images import difference, fit
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.features import pack_features
@@ -218,9 +218,11 @@ def test_embed_resizes_as_the_pack_does(model: Model) -> None:
     assert torch.equal(model.embed(vision=large)["vision"], model.embed(vision=small)["vision"])
 
 
-def test_background_is_subtracted_before_resizing(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_background_is_subtracted_at_the_stored_size_as_in_packs(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(3)
-    free, press = (rng.integers(0, 255, (2, 80, 100, 3), dtype=np.uint8) for _ in range(2))
+    free, press = (
+        np.stack([fit(x, 32) for x in rng.integers(0, 255, (2, 80, 100, 3), dtype=np.uint8)]) for _ in range(2)
+    )
     with pytest.raises(ValueError, match="background cannot be used"):
         model.embed(touch=press, background=free)
     monkeypatch.setattr(model, "spec", replace(model.spec, difference=True))

@@ -115,6 +115,9 @@ def good():
 def tokens():
     return nn.Flatten(2), {"size": 16, "mean": (0, 0, 0), "std": (1, 1, 1)}
 
+def same():
+    return nn.Flatten(2), {"size": 16, "mean": (0, 0, 0), "std": (1, 1, 1)}
+
 def two_frames():
     return nn.Conv2d(6, 5, 4, 4), {"size": 16, "frames": 2}
 
@@ -160,6 +163,8 @@ def test_python_functions(pack: Pack, functions: str) -> None:
     torch.testing.assert_close(tokens, (images.float() / 255).mean(1).flatten(1))
     with pytest.raises(ValueError, match="NaN or infinite features of touch"):
         open_model(f"{functions}nan").on(pack)[0].features("touch", images)
+    keys = [open_model(f"{functions}{name}").on(pack)[0] for name in ("tokens", "same", "same")]
+    assert len({net.features_key("touch") for net in keys}) == 3 and len({net.weights_digest() for net in keys}) == 2
     for name, words in (
         ("bare", "no torch module and dict"),
         ("wrong", "'sides'"),

@@ -1,5 +1,7 @@
 """Scores, intervals, differences and diagnostics: worked cases, and error rates over simulated pairs of equal methods."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -10,8 +12,10 @@ from sklearn.metrics import confusion_matrix, f1_score, precision_score, recall_
 
 from mvitac.evaluation import diagnostics as d
 from mvitac.evaluation import score_text
+from mvitac.evaluation.controls import label_controls
 from mvitac.evaluation.intervals import interval, least_p, paired_difference
-from mvitac.evaluation.scores import per_class, score, summarise
+from mvitac.evaluation.scores import per_class, pool_retrieval, score, summarise
+from support.toy import toy_pack
 
 
 def record(correct: list[int], seed: int | None, sizes: int = 10) -> dict:
@@ -229,3 +233,25 @@ def test_an_r2_far_below_0_weighs_no_more_than_a_few_accuracies() -> None:
     assert d.mean_error([[0.9], [0.6]]) == pytest.approx((0.1 * 0.4) ** 0.5)
     assert d.mean_error([[1.0], [0.5, 0.98]]) == pytest.approx((0.01 * (0.5 * 0.02) ** 0.5) ** 0.5)
     assert d.mean_error([[0.95], [-403.7]]) < d.mean_error([[0.1], [-300.0]])
+
+
+def test_folds_of_retrieval_are_one_record_of_all_queries() -> None:
+    seed = {"source": "a", "seed": 0, "direction": "touch -> vision", "leak": ""}
+    folds = [
+        {"R@1": 0.5, "R@5": 0.5, "chance R@5": 0.4, "num_groups": 2, "group_sizes": [1, 1], "group_correct": [0, 1]},
+        {"R@1": 0.0, "R@5": 1.0, "chance R@5": 0.2, "num_groups": 1, "group_sizes": [6], "group_correct": [6]},
+    ]
+    (found,) = pool_retrieval([seed | fold for fold in folds])
+    assert found["group_sizes"] == [1, 1, 6] and found["num_groups"] == 3 and found["group_correct"] == [0, 1, 6]
+    assert (found["R@1"], found["R@5"], found["chance R@5"]) == pytest.approx((0.125, 0.875, 0.25))
+
+
+def test_label_controls_are_scored_on_the_rows_of_each_modality(tmp_path: Path) -> None:
+    pack = toy_pack(tmp_path / "pack")
+    y, has = pack.labels("pattern"), pack.labels("pattern") == 0
+    has[np.flatnonzero(y == 1)[::4]] = True
+    pack.has = lambda modality: has if modality == "touch" else np.ones_like(has)  # type: ignore[method-assign]
+    task = next(task for task in pack.spec.tasks if task.name == "pattern")
+    found = {r["modality"]: r for r in label_controls(pack, [task], ("touch", "vision", "both"))}
+    assert [*found] == ["none", "touch", "both"] and found["touch"]["num_test"] == has[pack.rows("test")].sum()
+    assert found["touch"]["accuracy"] > found["none"]["accuracy"]

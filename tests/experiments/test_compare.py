@@ -586,6 +586,9 @@ def test_folds_are_run_apart_and_pooled(two_folds: Path, tmp_path: Path, capsys:
     assert one["group_correct"] == apart[0]["group_correct"] + apart[1]["group_correct"]
     assert one["accuracy"] == pytest.approx((apart[0]["accuracy"] + apart[1]["accuracy"]) / 2)
     assert one["auroc"] == pytest.approx((apart[0]["auroc"] + apart[1]["auroc"]) / 2)
+    assert one["balanced_accuracy"] == pytest.approx(
+        np.mean([row[k] / sum(row) for k, row in enumerate(one["confusion"])])
+    )
     (out / "fold2/runs/simclr/seed1/scores.json").unlink()
     (out / "fold2/runs/simclr/seed1/model.safetensors").unlink()
     main(["compare", "--plan", str(two_folds), "--out", str(out), "--tables-only"])

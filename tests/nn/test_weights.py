@@ -187,6 +187,12 @@ def test_positions_of_another_size_are_those_that_timm_makes(tmp_path: Path) -> 
     """timm knows the names and positions of its owners' files."""
     torch.manual_seed(0)
     large = timm.create_model("test_vit", img_size=160)
+    with pytest.raises(ValueError, match="left over"):  # two sets of weights, of which timm would take the second
+        load_weights(large, large.state_dict() | behind("visual.trunk.", large.state_dict()), "file")
+    with pytest.raises(ValueError, match=r"patch_embed\.proj\.weight .* of another shape"):
+        load_weights(
+            timm.create_model("test_vit", img_size=160, patch_size=8, num_classes=0), large.state_dict(), "file"
+        )
     small = timm.create_model("test_vit", img_size=96, num_classes=0)
     load_weights(small, large.state_dict(), "file")
     expected = timm.create_model(

@@ -35,13 +35,13 @@ FORMATS = ("JPEG", "PNG", "BMP", "TIFF", "WEBP", "PPM", "GIF")
 """What a file is read as, whatever its name (JPEG: a camera's MPO, too). Pillow would start Ghostscript for an EPS."""
 
 
-def decode(path: str | Path | BinaryIO, name: str = "", span: Sequence[float] = ()) -> Image.Image:
-    """Read an image file as RGB: rotated by EXIF, 16 bits scaled to 8, transparent parts black.
+def decode(path: str | Path | BinaryIO, name: str = "", span: Sequence[float] | None = None) -> Image.Image:
+    """Read an image file as RGB: rotated by EXIF, transparent parts black.
 
     Packs, ``find`` and ``live FOLDER`` read files with it; ``Model.embed`` treats PIL images alike.
 
-    ``name`` is the name of an open file in error messages; ``span`` are the numbers of 16 bits or floats that become
-    black and white, by default 0 and 65535.
+    ``name`` is the name of an open file in error messages. ``span``, for packs, are the numbers of 16 bits or floats that
+    become black and white, () for 0 and 65535; without it such files are a ValueError, as no model knows its pack's.
     """
     name = name or str(path)
     try:
@@ -97,14 +97,20 @@ def to_gray(values: np.ndarray, span: Sequence[float], clip: bool) -> np.ndarray
     return np.rint(np.clip((values - np.float64(low)) / (high - low), 0, 1) * 255).astype(np.uint8)
 
 
-def to_rgb(image: Image.Image, span: Sequence[float] = ()) -> Image.Image:
+def to_rgb(image: Image.Image, span: Sequence[float] | None = None) -> Image.Image:
     """An opened image as RGB, by the rules of ``decode``; ``image`` itself is not changed. Raises as ``decode``."""
     if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
         image = ImageOps.exif_transpose(image)
     if image.mode.startswith("I") or image.mode == "F":  # PIL's own conversion clips instead
+        if span is None:
+            raise ValueError(
+                "it has more than 8 bits, and a model does not know how its pack scaled them: pack it, too"
+            )
         if image.mode == "F" and not span:
             raise ValueError("it holds floating-point values of unknown range: --data.range COLUMN=LOW:HIGH")
         return Image.fromarray(to_gray(np.asarray(image), span or (0, 65535), bool(span))).convert("RGB")
+    if span:
+        raise ValueError(f"it is read as {image.mode} of 8 bits: --data.range is for gray images of more")
     if image.mode in ("LA", "La", "PA", "RGBA", "RGBa") or "transparency" in image.info:
         image = image.convert("RGBA")
         black = Image.new("RGBA", image.size, (0, 0, 0, 255))

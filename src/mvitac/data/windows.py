@@ -41,7 +41,8 @@ def windowed(pack: Pack, window: Window) -> Pack:
         kept[name] = [split if full else "hidden" for split, full in zip(pack.column(name), whole, strict=True)]
     made = pack.with_splits(kept)
     made.spec = replace(pack.spec, window=replace(window, order=places(pack, window)[0]))
-    made.digests = {**pack.digests, "window": digest([window.frames, window.stride, *window.of, window.minus_first])}
+    kind = [window.frames, float(window.stride), *window.of, window.minus_first, made.spec.window.order, window.short]
+    made.digests = {**pack.digests, "window": digest(kind)}
     rest = first if window.minus_first else None
     made.images = {m: Windows(pack.images[m], index, rest) if m in window.of else pack.images[m] for m in pack.images}
     return made

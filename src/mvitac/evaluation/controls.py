@@ -13,7 +13,16 @@ import torch.nn.functional as F
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import MODALITIES, AnyTask, DataSpec, Task
-from mvitac.evaluation.probe import names_in, probe_all, probe_features, probe_model, probes_of, score_rows, split_rows
+from mvitac.evaluation.probe import (
+    names_in,
+    probe_all,
+    probe_features,
+    probe_model,
+    probes_of,
+    score_rows,
+    seen_by,
+    split_rows,
+)
 from mvitac.evaluation.probe_config import Standardise
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.methods.simclr import SimCLRConfig
@@ -59,7 +68,7 @@ def controls_of(
     ``probes`` are those of the trunks; all other controls get logistic regression. ``specs``: what the runs were trained
     on, where that is not ``pack``. ``standardise``: as for the runs (``sensors.touch_features``), for the trunks.
     """
-    records = label_controls(pack, tasks)
+    records = label_controls(pack, tasks, modalities)
     starts, weights = starts_of(runs, specs or [pack.spec] * len(runs)), frozen_trunks(runs)
     fitted = sum(len(probes_of(task, probes)) for task in tasks) * (len(starts) + len(weights))
     num = len(modalities) * (len(tasks) + fitted) + len(tasks) * ("touch" in modalities)
@@ -87,11 +96,17 @@ def _named(source: str, seed: int | None, found: Records) -> Records:
     return [{"source": source, "seed": seed, **record} for record in found]
 
 
-def label_controls(pack: Pack, tasks: Sequence[AnyTask]) -> Records:
-    """What needs no image: the most common class or the mean value, and the dataset's own controls (table columns)."""
+def label_controls(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str] = ()) -> Records:
+    """What needs no image: the most common class or the mean value, and the dataset's own controls (table columns).
+
+    Where rows lack images, also on the rows of each of ``modalities``.
+    """
     records = []
-    for task in tasks:
-        rows = split_rows(pack, task)
+    cells = [(task, m) for task in tasks for m in ("none", *seen_by(pack, task, modalities))]
+    for task, modality in cells:
+        rows = split_rows(pack, task, modality)
+        if modality != "none" and np.array_equal(rows.all, split_rows(pack, task).all):
+            continue
         if isinstance(task, Task):
             answer = np.eye(len(task.classes))[np.bincount(pack.labels(task.name)[rows.fitted]).argmax()]
         else:
@@ -103,7 +118,7 @@ def label_controls(pack: Pack, tasks: Sequence[AnyTask]) -> Records:
             if np.isfinite(x).all():  # else rows of a part of a mix that has no such control
                 found[name] = probe_features(x, pack, task, rows, "linear" if isinstance(task, Task) else "curve", 0)
         for name, result in found.items():
-            records += _named(name, None, [{"task": task.name, "modality": "none", "probe": "linear", **result}])
+            records += _named(name, None, [{"task": task.name, "modality": modality, "probe": "linear", **result}])
     return records
 
 

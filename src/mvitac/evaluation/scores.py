@@ -45,8 +45,8 @@ def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_clas
 def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
     """Pool the records of cross-validation folds, whose test groups differ, into records of all groups.
 
-    Keeps only what every fold has scored. Accuracy, R2 and errors are over all rows. AUROC, F1 and balanced accuracy are
-    means over the folds that have them, since the folds' probes were fitted separately.
+    Keeps only what every fold has scored. Scores are over all rows; AUROC is the mean over the folds that have it, since
+    the probabilities of the folds' probes do not compare.
     """
     keys = ("source", "seed", "task", "modality", "probe")
     found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
@@ -68,18 +68,36 @@ def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
 
 def _pool_classes(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     sizes, correct = ([n for part in parts for n in part[key]] for key in ("group_sizes", "group_correct"))
-    means = {}
-    for key in ("balanced_accuracy", "macro_f1", "auroc"):
-        values = [part[key] for part in parts if part[key] is not None]
-        means[key] = float(np.mean(values)) if values else None
+    areas = [part["auroc"] for part in parts if part["auroc"] is not None]
+    sums = {key: np.sum([part[key] for part in parts], axis=0) for key in ("confusion", "class_groups")}
+    table, there = sums["confusion"], sums["confusion"].any(1)
+    right = table.diagonal()[there]
     return {
-        **means,
+        "balanced_accuracy": float((right / table.sum(1)[there]).mean()),
+        "macro_f1": float((2 * right / (table.sum(1) + table.sum(0))[there]).mean()),
+        "auroc": float(np.mean(areas)) if areas else None,
         "accuracy": sum(correct) / sum(sizes),
-        **{key: np.sum([part[key] for part in parts], axis=0).tolist() for key in ("confusion", "class_groups")},
+        **{key: value.tolist() for key, value in sums.items()},
         "num_test": sum(part["num_test"] for part in parts),
         "group_sizes": sizes,
         "group_correct": correct,
     }
+
+
+def pool_retrieval(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Pool the retrieval records of folds into one for each source, seed and direction: means over all queries."""
+    found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for record in records:
+        found.setdefault(tuple(record[key] for key in ("source", "seed", "direction")), []).append(record)
+    pooled = []
+    for parts in found.values():
+        weights = [sum(part["group_sizes"]) for part in parts]
+        rates = [key for key in parts[0] if "R@" in key]
+        lists = {key: [n for part in parts for n in part[key]] for key in ("group_sizes", "group_correct")}
+        means = {key: float(np.average([part[key] for part in parts], weights=weights)) for key in rates}
+        whole = {"num_groups": len(lists["group_sizes"]), "leak": leaks_in(parts)}
+        pooled.append({**parts[0], **lists, **means, **whole})
+    return pooled
 
 
 Cell = tuple[str, str, str]  # (task, modality, source)

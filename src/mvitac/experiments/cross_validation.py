@@ -14,7 +14,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
 from mvitac.evaluation.retrieval import MIN_GALLERY
-from mvitac.evaluation.scores import pool
+from mvitac.evaluation.scores import pool, pool_retrieval
 from mvitac.experiments.collect import gather, lay_out
 from mvitac.experiments.jobs import Work
 from mvitac.experiments.plan import Plan
@@ -75,7 +75,7 @@ def gather_folds(plan: Plan, works: Sequence[Work], out: Path, session: ProbeCon
         "plan": to_json(plan),
         "pack": digest([result["pack"] for result in results]),
         "records": pool([result["records"] for result in results]),
-        "retrieval": retrieval,
+        "retrieval": pool_retrieval(retrieval),
         "failed": {name: error for result in results for name, error in result["failed"].items()},
         **{key: list(dict.fromkeys(values)) for key, values in merged.items()},
         "run_precisions": {name: p for result in results for name, p in result["run_precisions"].items()},

@@ -102,7 +102,9 @@ def load_weights(network: nn.Module, tensors: State, file: Path | str) -> None:
     """
     expected, fitting, reasons = network.state_dict(), {}, {}
     for start in _starts(tensors):
-        for convert in (dict, partial(_converted, network)):
+        named = below(start, tensors).keys()  # timm would choose between two sets
+        several = expected.keys() <= named and len(named) >= 2 * len(expected)
+        for convert in (dict, partial(_converted, network))[: 1 if several else 2]:
             state = _prepared(network, convert(below(start, tensors)), expected)
             if not (why := misfit(expected, state)):
                 fitting[start] = state
@@ -146,12 +148,17 @@ def _starts(names: Iterable[str]) -> dict[str, None]:
 
 
 def _converted(network: nn.Module, state: State) -> State:
-    """``state`` with the names, and positions of the size, of timm's model; as it is where timm cannot."""
+    """``state`` with the names, and positions of the size, of timm's model; as it is where it cannot, or scales patches."""
     convert = getattr(sys.modules[type(network).__module__], "checkpoint_filter_fn", None)
     try:
-        return convert(dict(state), network) if convert else state
+        found = convert(dict(state), network) if convert else state
     except Exception:  # whatever timm's function makes of another network's weights
         return state
+    patches, shapes = (
+        found.get("patch_embed.proj.weight"),
+        {tensor.shape for tensor in state.values() if tensor.ndim == 4},
+    )
+    return found if patches is None or not shapes or patches.shape in shapes else state
 
 
 def _prepared(network: nn.Module, state: State, expected: State) -> State:

@@ -69,8 +69,8 @@ class Preprocess:
         """One image of any kind, or one clip, as a new uint8 array [stored, stored, channels], as a pack would store it."""
         frames, each = [], self.channels // self.frames
         for frame in self._clip(image) if self.frames > 1 else [image]:
-            array = to_array(frame, each, self.modality)
-            frames.append(np.array(fit(array if background is None else difference(array, background), self.stored)))
+            array = fit(to_array(frame, each, self.modality), self.stored)
+            frames.append(np.array(array if background is None else difference(array, fit(background, self.stored))))
         return np.concatenate(frames[::-1], axis=2)
 
     def _clip(self, value: Any) -> list[Any]:

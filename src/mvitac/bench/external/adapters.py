@@ -17,6 +17,7 @@ import importlib
 import math
 import re
 import sys
+import uuid
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -79,10 +80,11 @@ class Loaded:
     network: nn.Module  # images -> features [B, D]
     preprocessing: Preprocessing
     title: str  # its name in tables
-    files: tuple[Path, ...] = ()  # files with its weights
+    files: tuple[Path, ...] = ()  # files with its weights, or its code
     licence: str = UNKNOWN  # licence of the weights
     source: str = UNKNOWN  # where they are from
     trained_on: str = UNKNOWN  # the data it was trained on; ``NOTHING`` for random weights
+    code: str = ""  # tells features of code that may change from those in the cache
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,6 +172,7 @@ class Python(Adapter):
         about |= {name: str(given.pop(name)) for name in ABOUT if name in given}
         if isinstance(size := given.get("size"), int):
             given["size"] = (size, size)
+        about |= {"files": (Path(str(sys.modules[module].__file__)),), "code": uuid.uuid4().hex}
         return Loaded(Mean(network), from_json(Preprocessing, to_json(given), f"{self.place}()"), **about)
 
 

@@ -44,7 +44,7 @@ class ExternalEncoder(nn.Module):
         sized = {} if adapter.size is None else {"size": (adapter.size, adapter.size)}
         self.preprocessing = replace(loaded.preprocessing, **sized)
         digests = [digest_file(file) for file in loaded.files]
-        known = hashlib.sha256(f"{self.preprocessing} {digests}".encode()).digest()
+        known = hashlib.sha256(f"{adapter.place} {self.preprocessing} {digests}".encode()).digest()
         # A parameter, so that digests of the weights cover it and networks without weights have a device.
         self.identity = nn.Parameter(torch.frombuffer(bytearray(known), dtype=torch.uint8), requires_grad=False)
         shape = (3 * self.preprocessing.frames, *self.preprocessing.size)
@@ -187,10 +187,14 @@ class ExternalModel(Model):
         found = self.encoders[modality](images).float()
         if not torch.isfinite(found).all():
             raise ValueError(f"{self.text} gives NaN or infinite features of {modality}: check weights, mean and std")
+        if not (found == 0).all() and not 1e-3 < found.abs().max() < 1e12:  # probes add 1e-6 to a standard deviation
+            raise ValueError(
+                f"{self.text} gives features of {modality} up to {found.abs().max():.0e}: scale them to about 1"
+            )
         return found
 
     def features_key(self, modality: str) -> str:
-        return self.weights_digest()
+        return self.weights_digest() + self.part.loaded.code
 
     def describe(self) -> dict[str, Any]:
         """What is needed to repeat and to judge the scores, JSON-ready."""
