@@ -103,11 +103,7 @@ class Model(nn.Module):
             touch: Tactile images, likewise. For models trained on difference images: the differences.
             shared: Return embeddings in the space shared by both modalities, L2-normalised, instead of features.
 
-        Returns:
-            modality -> [B, D], or [B, E] with ``shared``.
-
-        Raises:
-            ValueError: If images do not fit the model.
+        Returns modality -> [B, D], or [B, E] with ``shared``; ValueError if images do not fit the model.
         """
         result = {}
         for modality, images in self._named(vision=vision, touch=touch).items():
@@ -145,9 +141,8 @@ class Model(nn.Module):
             normalize: Return the normalised input of ``trunk`` instead of the images that ``forward`` takes.
             background: For models trained on difference images: the sensor without contact, one image, to subtract.
 
-        Returns:
-            A function from an image (path, PIL image, array, tensor) to uint8 [C, stored, stored], or with ``normalize``
-            to fp32 [C, S, S]. It can be pickled.
+        Returns a function from an image (path, PIL image, array, tensor) to uint8 [C, stored, stored], or with ``normalize``
+        to fp32 [C, S, S]. It can be pickled.
         """
         self.check_modality(modality)
         self._check_background(modality, background)
@@ -160,9 +155,7 @@ class Model(nn.Module):
         """A copy of one encoder as a plain timm model, from normalised images [B, C, S, S] to features [B, D].
 
         Its ``pretrained_cfg`` has the input size, mean and std that ``timm.data.resolve_model_data_config`` reads.
-
-        Raises:
-            ValueError: If the model has no such encoder, or it is not a single timm model.
+        ValueError if the model has no such encoder, or it is not a single timm model.
         """
         self.check_modality(modality)
         channels, size, trunk = self.spec.channels(modality), self.sides(modality)[0], self.run.encoder[modality].trunk
@@ -171,7 +164,7 @@ class Model(nn.Module):
 
     @torch.no_grad()
     def features(self, modality: str, images: Tensor, *, for_heads: bool = False, bf16: bool = False) -> Tensor:
-        """Pooled features of images from a pack, without gradients.
+        """Pooled features [B, D], fp32, of images from a pack, without gradients.
 
         Args:
             modality: vision or touch.
@@ -179,9 +172,6 @@ class Model(nn.Module):
             for_heads: Compute the features that ``project`` and ``answer`` take. They see images at the size of the
                 training views (``Augment.size``), while probes see them at ``Augment.whole``.
             bf16: Compute in bf16.
-
-        Returns:
-            [B, D], fp32.
         """
         check_images(images, self.spec.channels(modality), modality)
         with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):

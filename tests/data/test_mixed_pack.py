@@ -218,7 +218,6 @@ def test_what_cannot_be_mixed_is_refused(pack: Pack, tmp_path: Path) -> None:
         (["a=x", "a=y"], "part 'a' is given twice"),
         (["a=x:2", "b=y"], r"parts a=x:2 b=y: give every part a weight \(NAME=FOLDER:WEIGHT\), or none"),
         (["a=x:0", "b=y:1"], "part 'a=x:0' has weight '0': give a positive number"),
-        (["a=x:1", "b=y:1", "--data.temperature", "0.5"], "temperature 0.5 has no effect on parts with weights"),
         (["a=x", "b=y"], "part a: no pack at x"),
     ],
 )

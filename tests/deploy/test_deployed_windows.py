@@ -26,6 +26,7 @@ from mvitac.model import Model
 from mvitac.recipes import recipe
 from mvitac.training.loop import train
 from support.faults import Clock, Rig
+from support.toy import film
 
 
 @pytest.fixture(scope="module")
@@ -178,12 +179,7 @@ def test_export_and_live_of_windows(
     np.testing.assert_allclose(engine(**images)["value_light"], wanted, rtol=1e-3, atol=1e-3)
     with pytest.raises(ValueError, match="touch: expected uint8"):
         engine(vision=images["vision"], touch=images["touch"][..., :3])
-    for m in ("vision", "touch"):
-        (tmp_path / m).mkdir()
-        for i in range(10):
-            image = measured.images[m][0] if i < 4 else 255 - measured.images[m][0]
-            Image.fromarray(image ^ np.uint8(i % 2)).save(tmp_path / m / f"{i:03d}.png")
-    command = ["live", str(out), "--vision", f"{tmp_path / 'vision'}@30", "--touch", f"{tmp_path / 'touch'}@30"]
+    command = ["live", str(out), *film(measured, tmp_path, rest=4, num=10, fps=30)]
     capsys.readouterr()
     assert main([*command, "--calibration", "2", "--stale", "60"]) == 0
     said = [json.loads(line) for line in capsys.readouterr().out.splitlines()]

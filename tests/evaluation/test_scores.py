@@ -32,9 +32,8 @@ def test_error_rates_are_no_more_than_stated(groups: int, equal: bool, seeds: in
     """At most 7 % instead of 5 %, also near the ceiling; with one seed there is no p to be wrong."""
     for accuracy, seed_sd in ((0.6, 0.03), (0.9, 0.012)):
         found = rates_of_error(groups, equal, seeds, accuracy, seed_sd, trials=150)
-        assert (found["p < .05"] is None) == (seeds == 1)
-        assert found["p < .05"] is None or found["p < .05"] <= 0.07
         assert found["outside interval"] <= 0.07
+        assert (found["p < .05"] is None) == (seeds == 1) and (found["p < .05"] or 0) <= 0.07
 
 
 @pytest.mark.parametrize(("groups", "seeds"), [(4, 1), (8, 3), (29, 1)])
@@ -237,13 +236,11 @@ def test_an_r2_far_below_0_weighs_no_more_than_a_few_accuracies() -> None:
 
 def test_folds_of_retrieval_are_one_record_of_all_queries() -> None:
     seed = {"source": "a", "seed": 0, "direction": "touch -> vision", "leak": ""}
-    folds = [
-        {"R@1": 0.5, "R@5": 0.5, "chance R@5": 0.4, "num_groups": 2, "group_sizes": [1, 1], "group_correct": [0, 1]},
-        {"R@1": 0.0, "R@5": 1.0, "chance R@5": 0.2, "num_groups": 1, "group_sizes": [6], "group_correct": [6]},
-    ]
-    (found,) = pool_retrieval([seed | fold for fold in folds])
+    one = {**seed, "R@1": 0.5, "R@5": 0.5, "num_groups": 2, "group_sizes": [1, 1], "group_correct": [0, 1]}
+    two = {**seed, "R@1": 0.0, "R@5": 1.0, "num_groups": 1, "group_sizes": [6], "group_correct": [6]}
+    (found,) = pool_retrieval([one, two])
     assert found["group_sizes"] == [1, 1, 6] and found["num_groups"] == 3 and found["group_correct"] == [0, 1, 6]
-    assert (found["R@1"], found["R@5"], found["chance R@5"]) == pytest.approx((0.125, 0.875, 0.25))
+    assert (found["R@1"], found["R@5"]) == (0.125, 0.875)
 
 
 def test_label_controls_are_scored_on_the_rows_of_each_modality(tmp_path: Path) -> None:

@@ -107,12 +107,9 @@ def test_rows_the_data_does_not_allow_are_told(tmp_path: Path) -> None:
         assert "the same run as 'MViTac'" in work.left_out[label]
     assert "the same run as 'no flips'" in work.left_out["no touch flips"]
     assert "lacks a modality" in work.left_out["losses vv"]
-    for method, wrong, words in (
-        ("cmc", {}, "no row that"),
-        ("moc", {}, "unknown"),
-        ("moco", {"method.tau": 1}, "unknown"),
-    ):
-        plan = small(pack, rows=(Row(label="MViTac", method=method, set=wrong),))
+    wrong: dict[str, object] = {"method.tau": 1}
+    for method, fields, words in (("cmc", {}, "no row that"), ("moc", {}, "unknown"), ("moco", wrong, "unknown")):
+        plan = small(pack, rows=(Row(label="MViTac", method=method, set=fields),))
         with pytest.raises(ValueError, match=words):
             lay_out(plan, pack, tmp_path / "out", ProbeConfig())
 

@@ -23,6 +23,7 @@ from mvitac.live.streams import Event, Stream
 from mvitac.model import Model
 from mvitac.system.files import read_json, write_json
 from support.faults import Clock, Rig, World, faulty
+from support.toy import film
 from support.videos import numbered, read_number, write_video
 
 
@@ -419,12 +420,7 @@ def test_each_artifact_of_a_run_is_exported_for_itself(
 
 def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Threads, files and lines of JSON together; ends when the files do."""
-    for m in ("vision", "touch"):
-        (tmp_path / m).mkdir()
-        for i in range(24):
-            image = pack.images[m][0] if i < 12 else 255 - pack.images[m][0]
-            Image.fromarray(image ^ np.uint8(i % 2)).save(tmp_path / m / f"{i:03d}.png")
-    command = ["live", str(onnx), "--vision", f"{tmp_path / 'vision'}@20", "--touch", f"{tmp_path / 'touch'}@20"]
+    command = ["live", str(onnx), *film(pack, tmp_path, rest=12, num=24, fps=20)]
     assert main([*command, "--calibration", "2", "--stale", "60", "--json", str(tmp_path / "s.json")]) == 0
     summary = json.loads((tmp_path / "s.json").read_text())
     assert summary["streams"]["touch"]["frames"] == 24 and summary["events"]["ended"] == 2

@@ -37,13 +37,10 @@ def cut(image: Tensor) -> np.ndarray:
     return torch.stack(found).double().numpy()
 
 
-def slow_predictor(predictor: Predictor, tokens: Tensor, at: Tensor, hidden: Tensor, *extra: Tensor) -> np.ndarray:
+def slow_predictor(predictor: Predictor, tokens: Tensor, at: Tensor, hidden: Tensor) -> np.ndarray:
     """Of one image: every place of the sequence has its position, mask tokens stand where patches are hidden."""
     where = sin_cos_positions(*GRID, predictor.embed.out_features)
     sequence = [predictor.embed(token) + where[place] for token, place in zip(tokens, at, strict=True)]
-    if extra:
-        assert predictor.other is not None
-        sequence += [predictor.other(token) + where[place] for token, place in zip(*extra, strict=True)]
     sequence += [predictor.mask_token[0, 0, 0] + where[place] for place in hidden]
     predicted = predictor.norm(predictor.blocks(torch.stack(sequence)[None]))[0, -len(hidden) :]
     return predictor.out(predicted).detach().double().numpy()
@@ -85,9 +82,9 @@ def test_as_many_patches_are_hidden_as_the_ratio_says(num: int, ratio: float, vi
     assert len({tuple(sorted(row)) for row in seen.tolist()}) > 1 or visible in (1, num - 1)
 
 
-@pytest.mark.parametrize(("pixel_norm", "senses"), [(True, "own"), (False, "own"), (True, "both")])
-def test_mae_is_the_mean_squared_error_of_hidden_patches(pixel_norm: bool, senses: str) -> None:
-    method = noisy(build("mae", config=MAEConfig(pixel_norm=pixel_norm, senses=senses)))  # type: ignore[arg-type]
+@pytest.mark.parametrize("pixel_norm", [True, False])
+def test_mae_is_the_mean_squared_error_of_hidden_patches(pixel_norm: bool) -> None:
+    method = noisy(build("mae", config=MAEConfig(pixel_norm=pixel_norm)))
     assert isinstance(method, MAE)
     batch = views(method, num=3)
     batch = replace(batch, seed=torch.tensor(11))
@@ -98,11 +95,10 @@ def test_mae_is_the_mean_squared_error_of_hidden_patches(pixel_norm: bool, sense
     }
     for i in range(3):
         seen = {m: seen_alone(method.trunks[m], batch.images[m][0][i], split[m][0][i]) for m in errors}
-        for m, other in (("vision", "touch"), ("touch", "vision")):
+        for m in ("vision", "touch"):
             at, hidden = (part[i] for part in split[m])
             assert (len(at), len(hidden)) == (4, 12)
-            extra = (seen[other], split[other][0][i]) if senses == "both" else ()
-            predicted = slow_predictor(method.decoders[m], seen[m], at, hidden, *extra)  # type: ignore[arg-type]
+            predicted = slow_predictor(method.decoders[m], seen[m], at, hidden)  # type: ignore[arg-type]
             for place, guess in zip(hidden, predicted, strict=True):
                 target = cut(batch.images[m][0][i])[place]
                 if pixel_norm:
@@ -168,9 +164,8 @@ def live(blocks: Blocks, row: int) -> Iterator[Tensor]:
         yield blocks.targets[row, k][blocks.in_target[row, k]]
 
 
-@pytest.mark.parametrize("senses", ["own", "both"])
-def test_ijepa_is_smooth_l1_to_the_teachers_normalised_tokens(senses: str) -> None:
-    method = noisy(build("ijepa", config=IJEPAConfig(senses=senses, target_scale=(0.1, 0.4))))  # type: ignore[arg-type]
+def test_ijepa_is_smooth_l1_to_the_teachers_normalised_tokens() -> None:
+    method = noisy(build("ijepa", config=IJEPAConfig(target_scale=(0.1, 0.4))))
     assert isinstance(method, IJEPA)
     batch = replace(views(method, num=3), seed=torch.tensor(5))
     found, errors = numbers(method, batch), {"vision": [], "touch": []}
@@ -178,14 +173,13 @@ def test_ijepa_is_smooth_l1_to_the_teachers_normalised_tokens(senses: str) -> No
     for i in range(3):
         context = {m: next(live(blocks[m], i)) for m in errors}
         seen = {m: seen_alone(method.trunks[m], batch.images[m][0][i], context[m]) for m in errors}
-        for m, other in (("vision", "touch"), ("touch", "vision")):
+        for m in ("vision", "touch"):
             whole = (
                 seen_alone(method.teachers[m].module, batch.images[m][0][i], torch.arange(16)).detach().double().numpy()
             )  # type: ignore[arg-type]
             normal = (whole - whole.mean(1, keepdims=True)) / np.sqrt(whole.var(1, keepdims=True) + 1e-5)
-            extra = (seen[other], context[other]) if senses == "both" else ()
             for block in list(live(blocks[m], i))[1:]:
-                guess = slow_predictor(method.predictors[m], seen[m], context[m], block, *extra)  # type: ignore[arg-type]
+                guess = slow_predictor(method.predictors[m], seen[m], context[m], block)  # type: ignore[arg-type]
                 off = np.abs(guess - normal[block])
                 errors[m].append(np.where(off < 1, 0.5 * off**2, off - 0.5).mean())
     for m, each in errors.items():
@@ -229,5 +223,3 @@ def test_other_trunks_and_views_of_one_patch_are_refused(name: str) -> None:
     small = replace(run, method=config, encoder=TINY_VIT, augment=replace(run.augment, size=8))
     with pytest.raises(ValueError, match=r"8 px are a single patch .*--augment\.size 16 or more"):
         small.check(spec(), 100, 72)
-    with pytest.raises(ValueError, match="senses both: dataset 'toy' has touch only"):
-        replace(config, senses="both").build(Toy(vision_channels=0).spec(), TINY_VIT)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from PIL import Image
 
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
@@ -134,3 +135,13 @@ class Holes(Toy):
         columns = {**sample.columns, **{f"has_{m}": present for m, present in has.items()}}
         images = {m: getattr(sample, m) if has[m] else None for m in has}
         return [Sample(columns=columns, **images)]
+
+
+def film(pack: Pack, folder: Path, *, rest: int, num: int, fps: int) -> list[str]:
+    """Write folders of ``num`` frames, of which the first ``rest`` show no contact; returns the words of a command."""
+    for m in ("vision", "touch"):
+        (folder / m).mkdir()
+        for i in range(num):
+            image = pack.images[m][0] if i < rest else 255 - pack.images[m][0]
+            Image.fromarray(image ^ np.uint8(i % 2)).save(folder / m / f"{i:03d}.png")
+    return [word for m in ("vision", "touch") for word in (f"--{m}", f"{folder / m}@{fps}")]

@@ -65,16 +65,6 @@ def test_weights_decide_what_is_drawn(parts: dict[str, str]) -> None:
     assert {len(set(batch)) for batch in found.tolist()} == {8}  # no row is its own negative, where a pass ends either
 
 
-def test_temperature(parts: dict[str, str]) -> None:
-    pack = mix_run(parts["a"], parts["b"], data={"temperature": 0.5}).data.open()
-    assert isinstance(pack, MixedPack)
-    sizes = np.bincount(pack.part_of[pack.rows("train")])
-    assert sizes[0] != sizes[1]
-    np.testing.assert_allclose(pack.shares(pack.rows("train")), np.sqrt(sizes) / np.sqrt(sizes).sum())
-    even = mix_run(parts["a"], parts["b"], data={"temperature": 0.0}).data.open()
-    assert isinstance(even, MixedPack) and even.shares(even.rows("train")).tolist() == [0.5, 0.5]
-
-
 @pytest.mark.parametrize("sampler", ["shuffle", "one-per-touch", "spread"])
 def test_batches_of_one_part(parts: dict[str, str], sampler: Any) -> None:
     run = mix_run(f"{parts['a']}:1", f"{parts['gel']}:1", batch_size=6, sampler=sampler, data={"batches": "one-part"})

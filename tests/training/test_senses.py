@@ -89,18 +89,6 @@ def test_every_method_trains_two_and_leaves_a_locked_one(pack: Pack, file: Path,
     assert all(p.requires_grad for p in mvitac.load(tmp_path / "run").parameters())  # it can be trained further
 
 
-@pytest.mark.parametrize("name", ["mae", "ijepa"])
-def test_masked_methods_read_tokens_of_another_width_and_grid(pack: Pack, tmp_path: Path, name: str) -> None:
-    vits = Encoders(
-        vision=EncoderConfig(trunk="mvitac_vit", weights=SCRATCH),
-        touch=EncoderConfig(trunk="mvitac_tiny_vit", weights=SCRATCH),
-    )
-    method = replace(small(name), senses="both")  # type: ignore[call-arg]
-    run = smoke(pack, encoder=vits, method=method, augment=SIZES, steps=1)
-    model = mvitac.load(train(run, tmp_path / "run", quiet=True))
-    assert {m: e.num_features for m, e in model.encoders.items()} == {"vision": 192, "touch": 64}
-
-
 @pytest.mark.parametrize("name", ["mvitac", "supervised"])
 def test_a_locked_trunk_sees_each_whole_image_once(
     pack: Pack, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str

@@ -49,7 +49,6 @@ class MixedPack(_Several):
 
     Attributes:
         weights: How often each part is drawn in training, relative to the others; () = by its number of rows.
-        temperature: Without weights, parts are drawn in proportion to (number of rows)^temperature.
         one_part: Whether all rows of a batch are of one part.
 
     Args:
@@ -60,14 +59,9 @@ class MixedPack(_Several):
     Raises:
         ValueError: If a part has no rows to train on, the parts differ in channels or in what touch images show, or are
             the same data, or train of one part and test of another share groups, rows or images.
-
-    Examples:
-        >>> pack = MixedPack({"tag": Pack("packs/tag"), "mine": Pack("packs/mine")})  # doctest: +SKIP
-        >>> pack.column("part")[pack.rows("train")]  # doctest: +SKIP
     """
 
     weights: tuple[float, ...] = ()
-    temperature: float = 1.0
     one_part: bool = False
 
     def __init__(self, parts: Mapping[str, Pack], *, size: int = 0, allow_leak: bool = False) -> None:
@@ -111,13 +105,13 @@ class MixedPack(_Several):
     def shares(self, rows: np.ndarray) -> np.ndarray:
         """Share [parts] of each part in the rows that training draws from ``rows``."""
         sizes = np.bincount(self.part_of[rows], minlength=len(self.parts))
-        drawn = np.array(self.weights) if self.weights else sizes**self.temperature * (sizes > 0)
+        drawn = np.array(self.weights) if self.weights else sizes
         return drawn / drawn.sum()
 
     @property
     def weighted(self) -> bool:
         """Whether training draws from the parts otherwise than from one pack of all rows."""
-        return bool(self.weights) or self.temperature != 1 or self.one_part
+        return bool(self.weights) or self.one_part
 
     def alone(self, part: str) -> Pack:
         """This pack with the rows of all other parts hidden, and the modalities of ``part``."""

@@ -23,9 +23,6 @@ class MixConfig(DatasetConfig):
     parts: tuple[str, ...] = ()
     """The packs, each as NAME=FOLDER:WEIGHT, such as tag=packs/tag:2 mine=packs/mine:1. NAME is by default the folder's.
     WEIGHT is the part's share of the drawn rows relative to the others; by default a part's number of rows."""
-    temperature: float = 1.0
-    """Without weights: parts are drawn in proportion to (number of rows)^temperature. 1: every row equally often. Below 1,
-    small parts are drawn more often (T3, arXiv:2406.13640: .5); 0: all parts equally often."""
     batches: Literal["mixed", "one-part"] = "mixed"
     """mixed: every batch has rows of all parts. one-part: each batch is of one part, so that no negative differs from the
     query by its dataset or sensor."""
@@ -39,8 +36,6 @@ class MixConfig(DatasetConfig):
     def __post_init__(self) -> None:
         self.frame_window()
         check_request(self.store, size=self.size or 256, workers=self.workers, quality=self.quality)
-        if not 0 <= self.temperature <= 10:
-            raise ValueError(f"temperature {self.temperature}: give a number from 0 to 10")
         names = [name for name, _, _ in self.named_parts()]
         for name in names:
             if names.count(name) > 1:
@@ -48,8 +43,6 @@ class MixConfig(DatasetConfig):
         weights = [weight for _, _, weight in self.named_parts()]
         if any(weights) and not all(weights):
             raise ValueError(f"parts {' '.join(self.parts)}: give every part a weight (NAME=FOLDER:WEIGHT), or none")
-        if any(weights) and self.temperature != 1:
-            raise ValueError(f"temperature {self.temperature} has no effect on parts with weights: leave one out")
 
     def named_parts(self) -> list[tuple[str, Path, float | None]]:
         """Name, folder and weight of each part."""
@@ -75,7 +68,7 @@ class MixConfig(DatasetConfig):
             except ValueError as error:
                 raise ValueError(f"part {name}: {error}") from None
         pack = MixedPack(parts, size=self.size, allow_leak=self.allow_leak)
-        pack.one_part, pack.temperature = self.batches == "one-part", self.temperature
+        pack.one_part = self.batches == "one-part"
         pack.weights = tuple(weight for _, _, weight in given if weight is not None)
         return pack
 

@@ -102,10 +102,9 @@ def label_controls(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[st
     Where rows lack images, also on the rows of each of ``modalities``.
     """
     records = []
-    cells = [(task, m) for task in tasks for m in ("none", *seen_by(pack, task, modalities))]
-    for task, modality in cells:
-        rows = split_rows(pack, task, modality)
-        if modality != "none" and np.array_equal(rows.all, split_rows(pack, task).all):
+    for task, modality in [(t, m) for t in tasks for m in ("none", *seen_by(pack, t, modalities))]:
+        rows, whole = split_rows(pack, task, modality), split_rows(pack, task).all
+        if modality != "none" and np.array_equal(rows.all, whole):
             continue
         if isinstance(task, Task):
             answer = np.eye(len(task.classes))[np.bincount(pack.labels(task.name)[rows.fitted]).argmax()]
@@ -114,9 +113,11 @@ def label_controls(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[st
         scores = score_rows(pack, task, rows.test, np.tile(answer, (len(rows.test), 1)))
         found = {"majority" if isinstance(task, Task) else "mean": scores}
         for name, columns in pack.spec.controls.items():
-            x = np.stack([pack.column(column)[rows.all].astype(float) for column in columns], axis=1)
-            if np.isfinite(x).all():  # else rows of a part of a mix that has no such control
-                found[name] = probe_features(x, pack, task, rows, "linear" if isinstance(task, Task) else "curve", 0)
+            x = np.stack([pack.column(column).astype(float) for column in columns], axis=1)
+            if np.isfinite(x[whole]).all():  # else rows of a part of a mix that has no such control
+                found[name] = probe_features(
+                    x[rows.all], pack, task, rows, "linear" if isinstance(task, Task) else "curve", 0
+                )
         for name, result in found.items():
             records += _named(name, None, [{"task": task.name, "modality": modality, "probe": "linear", **result}])
     return records

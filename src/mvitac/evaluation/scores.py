@@ -92,11 +92,10 @@ def pool_retrieval(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     pooled = []
     for parts in found.values():
         weights = [sum(part["group_sizes"]) for part in parts]
-        rates = [key for key in parts[0] if "R@" in key]
-        lists = {key: [n for part in parts for n in part[key]] for key in ("group_sizes", "group_correct")}
-        means = {key: float(np.average([part[key] for part in parts], weights=weights)) for key in rates}
-        whole = {"num_groups": len(lists["group_sizes"]), "leak": leaks_in(parts)}
-        pooled.append({**parts[0], **lists, **means, **whole})
+        rates = {k: float(np.average([p[k] for p in parts], weights=weights)) for k in parts[0] if "R@" in k}
+        lists = {k: [n for part in parts for n in part[k]] for k in ("group_sizes", "group_correct")}
+        whole = {**rates, **lists, "num_groups": len(lists["group_sizes"]), "leak": leaks_in(parts)}
+        pooled.append({**parts[0], **whole})
     return pooled
 
 

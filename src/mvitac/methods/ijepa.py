@@ -1,4 +1,4 @@
-"""I-JEPA (Assran et al., CVPR 2023, arXiv:2301.08243), for each modality, or with the other one in view.
+"""I-JEPA (Assran et al., CVPR 2023, arXiv:2301.08243), for each modality.
 
 A ViT sees a context: one large block of patches minus some small target blocks. From its output tokens a narrow predictor
 predicts, block by block, the tokens that a momentum (teacher) copy has for the target blocks when it sees the whole image:
@@ -6,15 +6,13 @@ predicts, block by block, the tokens that a momentum (teacher) copy has for the 
     L = smooth_L1(predictor(context, positions of a target block), layer_norm(teacher(image) at that block))
 
 averaged over blocks, patches and features. The layer norm has no weights, and smooth L1 turns at 1. The teacher follows with
-a momentum that rises linearly from .996 to 1. With ``senses both`` the predictor of touch also gets vision's context tokens,
-and that of vision touch's; each encoder still sees its own modality only. The frames of a window are channels of one image.
+a momentum that rises linearly from .996 to 1. The frames of a window are channels of one image.
 
 Block sizes are drawn once per batch (per chunk, with ``--chunk``), places once per image, as in the authors' code. Different
 here, because masks are made on the device without waiting for it:
 - Contexts have a fixed length, the (1 - .15)^4 of the image that 4 blocks leave if they do not overlap much: longer ones are
-  cut at random, missing patches of shorter ones are hidden from attention. Theirs are cut to the shortest of the batch.
-- Of 8 draws, the first with 10 patches of context, else that with the most. Theirs draw until it fits.
-- A block may touch the last row and column, and cover the whole image. Theirs are drawn one short of both.
+  cut at random, missing patches of shorter ones are hidden from attention.
+- Of 8 draws, the first with 10 patches of context, else that with the most. A block may touch every border.
 Sources: the paper (section 3, appendix A.1); facts of https://github.com/facebookresearch/ijepa (multiblock.py, train.py,
 in1k_vith14_ep300.yaml). Not implemented: the rising weight decay (here the recipe's, for all methods).
 
@@ -57,8 +55,6 @@ class IJEPAConfig(MethodConfig):
     """Area of a target block, as a range of shares of the image (I-JEPA: .15 to .2)."""
     ema: float = 0.996
     """Momentum of the teacher at the start (I-JEPA: .996). It rises to 1 linearly."""
-    senses: vit.Senses = "own"
-    """What a predictor sees. own: the context of its modality. both: also that of the other modality."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -137,12 +133,12 @@ class IJEPA(Contrastive):
     def __init__(self, config: IJEPAConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
-        self.trunks = vit.build_vits(encoder, spec, config.name, config.senses)
+        self.trunks = vit.build_vits(encoder, spec, config.name)
         self.teachers = nn.ModuleDict({m: Momentum(vit.vit_of(trunk)) for m, trunk in self.trunks.items()})
         self.predictors = nn.ModuleDict()
         for modality, trunk in self.trunks.items():
             width = vit.vit_of(trunk).embed_dim
-            self.predictors[modality] = vit.Predictor(self.trunks, modality, width, config.senses, 1 / 2, (384, 12))
+            self.predictors[modality] = vit.Predictor(trunk, width, 1 / 2, (384, 12))
 
     def blocks(self, batch: Views, modality: str) -> Blocks:
         """The blocks of each image that the ViT of ``modality`` sees."""
@@ -152,14 +148,11 @@ class IJEPA(Contrastive):
 
     def queries(self, batch: Views) -> Embeddings:
         """("predicted", modality) -> [B, M S, D]."""
-        found = {m: self.blocks(batch, m) for m in self.trunks}
-        seen = {}
-        for m, blocks in found.items():
-            seen[m] = vit.encode_visible(self.trunks[m], batch.images[m][0], blocks.context, blocks.in_context)
         result: Embeddings = {}
-        for modality, blocks in found.items():
-            other = next((seen[m] for m in seen if m != modality), None)
-            predicted = self.predictors[modality](seen[modality], blocks.targets, blocks.in_target, other)
+        for modality, trunk in self.trunks.items():
+            blocks = self.blocks(batch, modality)
+            seen = vit.encode_visible(trunk, batch.images[modality][0], blocks.context, blocks.in_context)
+            predicted = self.predictors[modality](seen, blocks.targets, blocks.in_target)
             result["predicted", modality] = predicted.flatten(1, 2)
         return result
 

@@ -1,13 +1,11 @@
-"""Masked autoencoder (He et al., CVPR 2022, arXiv:2111.06377), for each modality, or with the other one in view.
+"""Masked autoencoder (He et al., CVPR 2022, arXiv:2111.06377), for each modality.
 
 A ViT sees a random quarter of the patches. A narrow decoder gets its output tokens, and a mask token with its position for
 each hidden patch, and predicts the hidden pixels:
 
     L = mean over hidden patches i and their P pixels of (d_i - x_i)^2,    x_i <- (x_i - mean(x_i)) / sqrt(var(x_i) + 1e-6)
 
-The variance is the unbiased one (P - 1), as in the authors' code; Sparsh predicts plain pixels (``pixel_norm`` off). With
-``senses both`` the decoder of touch also gets the tokens of vision's visible patches, and that of vision those of touch, as
-in MultiMAE (Bachmann et al., arXiv:2204.01678). Each encoder still sees its own modality only.
+The variance is the unbiased one (P - 1), as in the authors' code; Sparsh predicts plain pixels (``pixel_norm`` off).
 The frames of a window are channels: a patch spans all of them, so that masks are tubes (VideoMAE, Tong et al.,
 arXiv:2203.12602, with one tubelet).
 Sources: the paper (section 3, appendix A); facts of https://github.com/facebookresearch/mae (models_mae.py).
@@ -45,8 +43,6 @@ class MAEConfig(MethodConfig):
     """Share of the patches that is hidden (MAE, Sparsh: .75; T3: .4)."""
     pixel_norm: bool = True
     """Predict each patch minus its mean and over its standard deviation (MAE, T3). Sparsh and AnyTouch: off."""
-    senses: vit.Senses = "own"
-    """What a decoder sees. own: the visible patches of its modality. both: also those of the other modality."""
 
     def __post_init__(self) -> None:
         check_range(self, 0.01, 0.99, "mask_ratio")
@@ -80,11 +76,11 @@ class MAE(Contrastive):
     def __init__(self, config: MAEConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
-        self.trunks = vit.build_vits(encoder, spec, config.name, config.senses)
+        self.trunks = vit.build_vits(encoder, spec, config.name)
         self.decoders = nn.ModuleDict()
         for modality, trunk in self.trunks.items():
             pixels = vit.patches(trunk, torch.zeros(1, spec.channels(modality), 1, 1)).shape[2]
-            self.decoders[modality] = vit.Predictor(self.trunks, modality, pixels, config.senses, 2 / 3, (512, 8))
+            self.decoders[modality] = vit.Predictor(trunk, pixels, 2 / 3, (512, 8))
 
     def queries(self, batch: Views) -> Embeddings:
         """("loss", modality) -> [B], the loss of each row."""
@@ -97,9 +93,7 @@ class MAE(Contrastive):
         result: Embeddings = {}
         for modality, trunk in self.trunks.items():
             images = batch.images[modality][0]
-            other = next((seen[m] for m in seen if m != modality), None)
-            decoder = self.decoders[modality]
-            predicted = decoder(seen[modality], hidden[modality][:, None], other=other)[:, 0]
+            predicted = self.decoders[modality](seen[modality], hidden[modality][:, None])[:, 0]
             with torch.autocast(images.device.type, enabled=False):
                 values = vit.take(vit.patches(trunk, images.float()), hidden[modality])
                 error = (predicted.float() - pixel_targets(values, self.config.pixel_norm)) ** 2

@@ -6,7 +6,7 @@ D features.
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -18,7 +18,6 @@ from torch import Tensor, nn
 from mvitac.data.spec import DataSpec
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, build_trunk, sin_cos_positions
 
-Senses = Literal["own", "both"]  # whether a predictor sees tokens of its own modality, or of both
 _GOLDEN, _MULTIPLIERS = -0x61C8864680B583EB, (-0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15)
 """The constants of SplitMix64 (Steele et al., OOPSLA 2014) as signed numbers."""
 
@@ -58,14 +57,11 @@ def _plain(trunk: nn.Module, name: str, method: str) -> VisionTransformer:
     return trunk
 
 
-def build_vits(config: Encoders, spec: DataSpec, method: str, senses: Senses) -> nn.ModuleDict:
+def build_vits(config: Encoders, spec: DataSpec, method: str) -> nn.ModuleDict:
     """A ViT per modality of ``spec``, whose features are the mean over its patches, as no class token is trained here.
 
-    ValueError if the trunk is no plain ViT, or ``senses`` or how windows are read does not fit the data.
+    ValueError if the trunk is no plain ViT, or does not read the frames of a window together.
     """
-    if senses == "both" and len(spec.modalities) < 2:
-        have = ", ".join(spec.modalities)
-        raise ValueError(f"senses both: dataset {spec.name!r} has {have} only, give --method.senses own")
     trunks = nn.ModuleDict()
     for modality in spec.modalities:
         own = config[modality]
@@ -140,21 +136,17 @@ class Predictor(nn.Module):
     A hidden patch is a learned mask token plus the fixed sine-cosine embedding of its position.
 
     Args:
-        trunks: modality -> trunk.
-        modality: Whose tokens it reads; with ``senses`` both also those of the other one.
+        trunk: Whose tokens it reads.
         out: Width of the predictions.
         share, most: Width and number of blocks are this share of the trunk's, in whole heads of 32 features, up to ``most``.
     """
 
-    def __init__(
-        self, trunks: nn.ModuleDict, modality: str, out: int, senses: Senses, share: float, most: tuple[int, int]
-    ) -> None:
+    def __init__(self, trunk: nn.Module, out: int, share: float, most: tuple[int, int]) -> None:
         super().__init__()
-        vit, others = vit_of(trunks[modality]), [trunk for m, trunk in trunks.items() if m != modality]
+        vit = vit_of(trunk)
         width = min(most[0], 32 * max(1, round(vit.embed_dim * share / 32)))
         depth = min(most[1], max(1, round(len(vit.blocks) * share)))
         self.embed = nn.Linear(vit.embed_dim, width)
-        self.other = nn.Linear(vit_of(others[0]).embed_dim, width) if senses == "both" else None
         self.mask_token = nn.Parameter(torch.zeros(1, 1, 1, width))
         norm: Any = partial(nn.LayerNorm, eps=1e-6)
         self.blocks = nn.Sequential(*(Block(width, width // 32, qkv_bias=True, norm_layer=norm) for _ in range(depth)))
@@ -167,31 +159,23 @@ class Predictor(nn.Module):
                 nn.init.zeros_(layer.bias)
 
     def forward(
-        self,
-        seen: Tokens,
-        hidden: Int[Tensor, "B M T"],
-        live: Bool[Tensor, "B M T"] | None = None,
-        other: Tokens | None = None,
+        self, seen: Tokens, hidden: Int[Tensor, "B M T"], live: Bool[Tensor, "B M T"] | None = None
     ) -> Float[Tensor, "B M T O"]:
-        """Predict each of M sets of ``hidden`` patches on its own, from the visible tokens ``seen`` and ``other``.
+        """Predict each of M sets of ``hidden`` patches on its own, from the visible tokens ``seen``.
 
         ``live`` says which of ``hidden`` count, if the visible tokens say which of them do. No token attends to the
         others.
         """
         width = self.mask_token.shape[3]
         positions = sin_cos_positions(*seen.grid, width, hidden.device)
-        known, known_live = _placed(self.embed(seen.values), seen.at, positions), seen.live
-        if self.other is not None and other is not None:
-            places = sin_cos_positions(*other.grid, width, hidden.device)
-            known = torch.cat([known, _placed(self.other(other.values), other.at, places)], dim=1)
-            known_live = None if seen.live is None or other.live is None else torch.cat([seen.live, other.live], dim=1)
+        known = _placed(self.embed(seen.values), seen.at, positions)
         num_sets, length = hidden.shape[1:]
         masked = (self.mask_token + positions[hidden]).to(known.dtype)
         tokens = torch.cat([known[:, None].expand(-1, num_sets, -1, -1), masked], dim=2).flatten(0, 1)
         shown = None
         if live is not None:
-            assert known_live is not None
-            shown = torch.cat([known_live[:, None].expand(-1, num_sets, -1), live], dim=2).flatten(0, 1)
+            assert seen.live is not None
+            shown = torch.cat([seen.live[:, None].expand(-1, num_sets, -1), live], dim=2).flatten(0, 1)
         predicted = _pass(self.blocks, tokens, shown)[:, -length:]
         return self.out(self.norm(predicted)).unflatten(0, (-1, num_sets))
 

@@ -47,7 +47,7 @@ def train(
     pack: Pack | None = None,
     validate: bool = True,
 ) -> Path:
-    """Pre-train and write the result into a folder.
+    """Pre-train and write the result into the folder ``out``, which is returned.
 
     The folder gets run.json (the settings), trained_on.safetensors (hashes of the rows it learns from), log.jsonl,
     checkpoint.pt (to resume from) and model.safetensors (the result). With ``eval_every``, model.best.safetensors has the
@@ -61,9 +61,6 @@ def train(
         loggers: Functions ``(step, values)`` that receive all logged values.
         pack: The data, if it is already open. Default: open it from ``run.data``.
         validate: Evaluate on held-out groups. It changes no weights.
-
-    Returns:
-        ``out``.
 
     Raises:
         ValueError: If the settings are impossible; where possible, before the first step.
