@@ -2,10 +2,10 @@
 
     python -m benchmarks.gpu [--minutes 25] [--out FOLDER] [--resume FOLDER] [--commit HASH] [--smoke]
 
-1. Speed (``benchmarks.speed``): the step at batches 64 to 1,024, plain, compiled and with CUDA graphs; input, end to
-   end, probe, gradient caching.
-2. Simulated materials at 256 px, as many as fit in the time.
-3. Table I from ImageNet (``mvitac compare``): rows of examples/imagenet.toml at 224 px, seed by seed.
+1. Simulated materials at 256 px, as many as fit in the time.
+2. Table I from ImageNet (``mvitac compare``): rows of examples/imagenet.toml at 224 px, seed by seed.
+3. Speed (``benchmarks.speed``): the step at batches 64 to 1,024, plain and compiled; input, end to end, probe, gradient
+   caching.
 
 ``<out>/gpu.json`` has all figures. It is written after each part, and what is in it is not measured again.
 ``<out>/runs.tar.gz`` has the small files of finished runs. Both together continue on another machine (``--resume``). A
@@ -320,8 +320,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--smoke", action="store_true", help="a rehearsal in seconds")
     session = Session(parser.parse_args(argv))
     session.save()
-    measure_speed(session)
     compare_methods(session)
+    measure_speed(session)
     session.save()
     session.say(f"written: {session.out}/gpu.json; the same command continues")
 
