@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,12 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from filelock import FileLock
+from threadpoolctl import threadpool_info
 
 from mvitac.data import build as packing
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
+from mvitac.data.read_samples import read_parts
 from mvitac.data.source import Lost, Sample, Source
 from mvitac.datasets.pack import ON_VAL, PackConfig
 from mvitac.evaluation.retrieval import retrieved_rows
@@ -49,6 +52,16 @@ def test_rows_and_images_belong_together(pack: Pack) -> None:
 def test_two_processes_give_the_bytes_of_one(tmp_path: Path, store: Any) -> None:
     one, two = (build(Toy(), tmp_path / str(n), size=32, workers=n, store=store, quiet=True) for n in (1, 2))
     assert one.digest == two.digest
+
+
+def threads_of(first: int, end: int) -> Any:
+    return [library["num_threads"] for library in threadpool_info()]
+
+
+def test_a_packing_process_has_one_thread(monkeypatch: Any) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    # 16 processes of 16 threads each took four times as long per image on a machine with a GPU.
+    assert set(chain(*read_parts(threads_of, [(0, 1), (1, 2)], workers=2))) == {1}
 
 
 @contextmanager

@@ -13,13 +13,14 @@ import numpy as np
 from mvitac.control.learn import Lesson
 from mvitac.control.servo import STEP_MM, STEP_MS, TASKS, begun, picture, presses, task_of
 from mvitac.control.suite import Cell, LoopSuite
+from mvitac.data.read_samples import one_thread
 from mvitac.evaluation.intervals import mean_interval
 
 
 @cache
 def _processes() -> ProcessPoolExecutor:
     """What renders; the processes import no torch, and end with this one."""
-    return ProcessPoolExecutor(os.cpu_count(), multiprocessing.get_context("spawn"))
+    return ProcessPoolExecutor(os.cpu_count(), multiprocessing.get_context("spawn"), one_thread)
 
 
 @dataclass(frozen=True, kw_only=True)

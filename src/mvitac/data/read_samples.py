@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from threadpoolctl import threadpool_limits
 
 from mvitac.data.images import fit
 from mvitac.data.jpeg import encode
@@ -130,14 +131,20 @@ def read_parts(
             pool.shutdown(wait=True, cancel_futures=True)
 
 
+def one_thread() -> None:
+    """Give this process one core; this also fixes the order of sums."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    threadpool_limits(1)  # of libraries that are loaded, which do not read the variable again
+
+
 _reader: Reader  # of this worker process
 
 
 def _start_worker(file: str) -> None:
     global _reader
     keep_freed_memory()
-    os.environ["OMP_NUM_THREADS"] = "1"  # one core per worker; also fixes the order of sums
     _reader = pickle.loads(Path(file).read_bytes())
+    one_thread()
 
 
 def _read_here(first: int, end: int) -> tuple[Part, dict[str, bytes]]:

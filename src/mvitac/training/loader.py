@@ -34,7 +34,7 @@ class Feed:
     def _upload(self, images: Images) -> Tensor:
         whole = torch.empty(images.shape, dtype=torch.uint8, device=self.device)
         for start in range(0, len(images), 4096):  # read the file once, in order
-            piece = np.ascontiguousarray(images[start : start + 4096])
+            piece = np.array(images[start : start + 4096])  # a copy: torch warns of an array that cannot be written
             whole[start : start + 4096] = torch.from_numpy(piece)
         return whole
 
