@@ -20,7 +20,6 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from filelock import FileLock
-from threadpoolctl import threadpool_info
 
 from mvitac.data import build as packing
 from mvitac.data.build import build
@@ -30,7 +29,7 @@ from mvitac.data.source import Lost, Sample, Source
 from mvitac.datasets.pack import ON_VAL, PackConfig
 from mvitac.evaluation.retrieval import retrieved_rows
 from mvitac.system import locks
-from support.toy import Counting, Toy, toy_pack
+from support.toy import Counting, Toy, threads_of, toy_pack
 
 FILES = ("pack.json", "samples.parquet", "vision.npy", "touch.npy")
 
@@ -52,10 +51,6 @@ def test_rows_and_images_belong_together(pack: Pack) -> None:
 def test_two_processes_give_the_bytes_of_one(tmp_path: Path, store: Any) -> None:
     one, two = (build(Toy(), tmp_path / str(n), size=32, workers=n, store=store, quiet=True) for n in (1, 2))
     assert one.digest == two.digest
-
-
-def threads_of(first: int, end: int) -> Any:
-    return [library["num_threads"] for library in threadpool_info()]
 
 
 def test_a_packing_process_has_one_thread(monkeypatch: Any) -> None:

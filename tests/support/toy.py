@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from PIL import Image
+from threadpoolctl import threadpool_info
 
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
@@ -145,3 +146,8 @@ def film(pack: Pack, folder: Path, *, rest: int, num: int, fps: int) -> list[str
             image = pack.images[m][0] if i < rest else 255 - pack.images[m][0]
             Image.fromarray(image ^ np.uint8(i % 2)).save(folder / m / f"{i:03d}.png")
     return [word for m in ("vision", "touch") for word in (f"--{m}", f"{folder / m}@{fps}")]
+
+
+def threads_of(first: int, end: int) -> Any:
+    """A reader that gives the numbers of threads of the libraries of its process."""
+    return [library["num_threads"] for library in threadpool_info()]
