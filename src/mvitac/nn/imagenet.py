@@ -2,12 +2,14 @@
 
 import pkgutil
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import timm
 import torch
 from huggingface_hub import constants, get_session, try_to_load_from_cache
+from timm.models import load_pretrained
 from torch import Tensor, nn
 
 from mvitac.system.files import brief
@@ -47,10 +49,10 @@ def load(trunk: str, arguments: dict[str, Any]) -> nn.Module:
     """timm's ``trunk`` with its ImageNet weights, made with ``arguments``. ValueError if they cannot be had."""
     package = None if _is_cached(trunk) else _installed(trunk)
     if package:
-        made = timm.create_model(
-            trunk, pretrained=True, pretrained_cfg_overlay={"state_dict": _renamed(trunk, package)}, **arguments
-        )
-        made.pretrained_cfg["state_dict"] = None  # type: ignore[index]  # copies of the trunk would copy it
+        made = timm.create_model(trunk, **arguments)
+        known: Any = made.pretrained_cfg
+        cfg = {**known, "state_dict": {**_renamed(trunk, package)}}
+        load_pretrained(made, cfg, arguments["num_classes"], arguments["in_chans"])
         return made
     hub = _hub(trunk)
     url = f"{constants.ENDPOINT}/{hub}/resolve/main/{_FILES[0]}"
@@ -83,6 +85,7 @@ def _installed(trunk: str) -> Package | None:
         return None
 
 
+@cache
 def _renamed(trunk: str, package: Package) -> dict[str, Tensor]:
     """The package's tensors by timm's names: in the same order, with the same last names and shapes; or a ValueError."""
     given = torch.load(pkgutil.resolve_name(package.file)(), map_location="cpu", weights_only=True)
