@@ -36,12 +36,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session", autouse=True)
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Packs and features of the tests live and die with them."""
-    import torch
+    from support import warm  # noqa: F401
 
     path = tmp_path_factory.mktemp("cache")
     os.environ["MVITAC_CACHE"] = str(path)
-    torch.set_num_threads(1)
-    gc.freeze()  # what was imported stays: the garbage collector need not look at it again and again
     yield path
     gc.unfreeze()  # else libraries report what is left at exit, after pytest's summary
 

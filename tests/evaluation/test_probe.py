@@ -20,6 +20,7 @@ from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
 from mvitac.datasets.pack import PackConfig
+from mvitac.evaluation import controls
 from mvitac.evaluation import features as features_module
 from mvitac.evaluation.classifiers import fit_knn, fit_linear, fit_papers
 from mvitac.evaluation.controls import borders, controls_of, frozen_trunks, imagenet_trunk, starts_of, thumbnails
@@ -375,7 +376,7 @@ def test_frozen_trunks_are_imagenet_and_files_that_runs_started_from() -> None:
     assert frozen_trunks([run, large])[1][1].augment.whole_of("touch") == 48  # as that run saw them
     (_, control), *rest = frozen_trunks([run])
     assert not rest and {control.encoder[m].trunk for m in ("vision", "touch")} == {"tf_efficientnet_lite0"}
-    assert {control.augment.whole_of(m) for m in ("vision", "touch")} == {128}
+    assert {control.augment.whole_of(m) for m in ("vision", "touch")} == {controls.IMAGENET_SIDE}
 
 
 def test_the_runs_own_trunk_is_the_imagenet_control_where_its_weights_are(monkeypatch: pytest.MonkeyPatch) -> None:
