@@ -351,7 +351,7 @@ def test_rows_of_one_task_alone_are_hidden_from_all_else(pack: Pack) -> None:
     assert hidden and set(pack.rows("test")) - set(other.rows("test")) == hidden == set(np.flatnonzero(other.hidden))
     assert set(other.rows("train")) == set(pack.rows("train"))  # without a label, but for pre-training
     assert set(other.rows("train", by="split_bright")) == set(range(0, pack.num, 2))  # its own split has them
-    assert not {*retrieved_rows(other)} & hidden and hidden < {*retrieved_rows(pack)}
+    assert not {*retrieved_rows(other, "test")} & hidden and hidden < {*retrieved_rows(pack, "test")}
     unlabelled = Pack(pack.path)
     unlabelled.table = other.table
     assert not unlabelled.hidden.any()  # one split for all tasks: nobody else may see them

@@ -122,7 +122,7 @@ def test_frames_that_only_the_rough_lists_name_are_hidden_from_all_else() -> Non
     split, touch = pack.column("split"), pack.column("touch_group")
     named = np.array([frame.listed for frame in listed])
     assert (split == "test").sum() == 50_614 and len(set(touch[split == "test"]) & set(touch[split == "train"])) == 177
-    test = retrieved_rows(pack)
+    test = retrieved_rows(pack, "test")
     assert len(test) == 29_879 and set(named[test]) == {"test"}
     assert not set(touch[test]) & set(touch[pack.rows("train")])
     assert pack.hidden.sum() == 20_735 and (pack.column("split_rough")[pack.hidden] == "train").sum() == 16_892

@@ -169,8 +169,9 @@ def test_asks_nothing_of_the_network(materials: Path) -> None:
 
 
 def test_a_mistake_is_nearest_to_another_class_by_touch_alone(tmp_path: Path) -> None:
-    near = nearest_rows(np.array([[1.0, 0.0], [0.9, 0.1], [5.0, 1.0], [0.0, 2.0]]), np.array(["a", "a", "b", "c"]), 2)
-    assert near.tolist() == [[2, 3], [2, 3], [1, 0], [2, 1]]  # never of the own group; lengths do not matter
+    values = np.array([[1.0, 0.0], [0.9, 0.1], [5.0, 1.0], [0.0, 2.0]])  # lengths do not matter
+    near = nearest_rows(values, np.array(["a", "a", "b", "c"]), 2)
+    assert near.tolist() == [[2, 3], [2, 3], [1, 3], [2, 1]]  # one of each other group
     run, _ = noise(tmp_path, Noise(vision=0))
     html = write_report([run], tmp_path / "out", quiet=True).read_text()
     assert "Not scored: it takes a space that both modalities share" in html
@@ -180,7 +181,7 @@ def test_a_mistake_is_nearest_to_another_class_by_touch_alone(tmp_path: Path) ->
     assert 2 <= len(strips) <= 16 and re.search(r"touch: \d+ of 24 rows", html)
     for strip in strips:
         marks = re.findall(r'<div class="(same|wrong)">', strip)
-        assert len(marks) == 5 and marks.count("same") <= 2
+        assert len(marks) == 5 and marks[0] == "wrong"
         own, *found = re.findall(r"<span>(.*?)[;<]", strip)
         assert [mark == "same" for mark in marks] == [name == own for name in found]
 
@@ -283,7 +284,6 @@ def test_one_test_group_proves_nothing(tmp_path: Path) -> None:
     page = Page(write_report([run], tmp_path / "out", quiet=True).read_text())
     assert "11 test things with both." in page.text
     assert "1 test thing, so no interval" in page.text and "% [0.0, 100.0]" in page.text
-    assert not page.images("jpeg")
     card = (publish(run, tmp_path / "card") / "README.md").read_text()
     assert "(1 test thing, so no interval)" in card and re.search(r"\| untrained \| \S+ \[0\.0, 100\.0\] \|", card)
 

@@ -220,7 +220,7 @@ def _probe_models(
         for record in records:
             record["source"] += END_TO_END if record["probe"] == "own" else ""
         ranked = cross_modal(model, pack)
-        return records, [{**own, **r, "leak": rows.leak(learned, retrieved_rows(pack))} for r in ranked]
+        return records, [{**own, **r, "leak": rows.leak(learned, retrieved_rows(pack, "test"))} for r in ranked]
 
     num = len(each) * len(modalities) * sum(len(probes_of(task, session.kinds)) for task in tasks)
     with work("fitting probes", num, "probes"):

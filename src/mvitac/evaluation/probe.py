@@ -23,8 +23,6 @@ from mvitac.evaluation.value_scores import score_values
 from mvitac.model import Model
 from mvitac.system.progress import tick
 
-PROBES = ("linear", "paper", "knn")
-"""linear: logistic regression, C chosen on validation groups. paper: dropout .2, Adam 1e-4, 60 epochs. knn: 20 nearest."""
 VALUE_PROBES = ("linear", "knn")
 """Probes of tasks with values: ridge regression, alpha chosen on validation groups, and the mean of the 20 nearest."""
 
@@ -143,7 +141,7 @@ def fit_and_score(
 def fit_probe(
     x: np.ndarray, pack: Pack, task: AnyTask, rows: ProbeSplit, kind: str, seed: int, paper: Classifier | None = None
 ) -> tuple[Fitted, dict[str, Any]]:
-    """Fit one probe on features ``x`` of ``rows.fitted``: ``PROBES``, and ``curve`` for controls with values.
+    """Fit one probe on features ``x`` of ``rows.fitted``: linear, paper, knn, and ``curve`` for controls with values.
 
     Returns:
         A function from features [N, D] to class probabilities [N, K] or values [N, T], and what was chosen (C or alpha of

@@ -22,10 +22,10 @@ def shared_space(model: Model, pack: Pack, rows: np.ndarray) -> dict[str, Tensor
     return {m: model.project(m, x.to(device)).cpu() for m, x in z.items()}
 
 
-def retrieved_rows(pack: Pack, split: str = "test") -> np.ndarray:
-    """Rows of ``split`` with all modalities, of the phase that the first task is about."""
+def retrieved_rows(pack: Pack, *splits: str) -> np.ndarray:
+    """Rows of ``splits`` with all modalities, of the phase that the first task is about."""
     only = pack.spec.tasks[0].only if pack.spec.tasks else None
-    return pack.rows(split, only=only, having=pack.spec.modalities)
+    return pack.rows(*splits, only=only, having=pack.spec.modalities)
 
 
 def cross_modal(model: Model, pack: Pack) -> list[dict[str, Any]]:
@@ -36,7 +36,7 @@ def cross_modal(model: Model, pack: Pack) -> list[dict[str, Any]]:
     """
     if len(model.projectors) < 2 or len(pack.spec.modalities) < 2:
         return []
-    rows = retrieved_rows(pack)
+    rows = retrieved_rows(pack, "test")
     sizes = np.bincount(group_numbers(pack, rows))
     if len(sizes) < MIN_GALLERY:
         return []

@@ -5,7 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from markupsafe import Markup
 
+from mvitac.data.pack_table import SPLITS
 from mvitac.evaluation.features import features, sample
+from mvitac.evaluation.retrieval import retrieved_rows
 from mvitac.report import figures
 from mvitac.report.html import blocks as html
 from mvitac.report.html import picture
@@ -15,35 +17,37 @@ NUM_ROWS, NUM_QUERIES, NUM_FOUND = 1500, 8, 5
 
 
 def nearest_rows(values: np.ndarray, groups: np.ndarray, num: int = NUM_FOUND) -> np.ndarray:
-    """The ``num`` rows of other ``groups`` [N] whose ``values`` [N, D] are nearest by cosine, of each row: [N, num]."""
+    """Of each of N rows, its nearest row by cosine of ``values`` [N, D] in each of the ``num`` nearest other ``groups``."""
     unit = values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12)
-    similarity = np.where(groups[:, None] == groups, -np.inf, unit @ unit.T)
-    return np.argsort(-similarity, axis=1, kind="stable")[:, :num]
+    order = np.argsort(-np.where(groups[:, None] == groups, -np.inf, unit @ unit.T), axis=1, kind="stable")
+    firsts = (np.sort(np.unique(groups[row], return_index=True)[1])[:num] for row in order)  # the own group is last
+    return np.stack([row[first] for row, first in zip(order, firsts, strict=True)])
 
 
 def mistakes(study: Study) -> list[Markup]:
-    """Random rows whose nearest rows have another class, with these; without any labels, random rows."""
-    split, rows = study.rows()
-    rows = sample(rows, NUM_ROWS)
-    groups, labels = study.pack.column("group")[rows].astype(str), study.labels(rows)
-    if len(rows) - np.unique(groups, return_counts=True)[1].max() < NUM_FOUND:
-        return []  # too few rows of other groups
-    halves, known = [], bool((labels >= 0).any())
-    for modality in study.pack.spec.modalities:
-        near = nearest_rows(features(study.runs[0].model, study.pack, modality, rows), groups)
-        same = labels[near] == labels[:, None]
-        asked = np.flatnonzero((labels >= 0) & (same.sum(1) <= NUM_FOUND // 2) if known else labels < 0)
-        shown = []
-        for at in sample(asked, NUM_QUERIES).tolist():
+    """Random rows whose nearest row has another class, with the nearest; without any labels, random rows."""
+    (split, shown), pack = study.rows(), study.pack
+    rows = np.union1d(shown := sample(shown, NUM_ROWS), sample(retrieved_rows(pack, *SPLITS), NUM_ROWS))
+    groups, labels = pack.column("group")[rows].astype(str), study.labels(rows)
+    if (num := min(NUM_FOUND, len(np.unique(groups)) - 1)) == 0:
+        return []
+    halves, known, asked = [], bool((labels >= 0).any()), np.isin(rows, shown)
+    shared = [label for label in np.unique(labels) if len(np.unique(groups[labels == label])) > 1]
+    for modality in pack.spec.modalities:
+        near = nearest_rows(features(study.runs[0].model, pack, modality, rows), groups, num)
+        wrong = np.isin(labels, shared) & (labels >= 0) & (labels[near[:, 0]] != labels) if known else labels < 0
+        strips = []
+        for at in sample(np.flatnonzero(asked & wrong), NUM_QUERIES).tolist():
             kinds = ("" if labels[i] < 0 else "same class" if labels[i] == labels[at] else "other" for i in near[at])
             found = list(zip(rows[near[at]].tolist(), kinds, strict=True))
-            shown.append(_strip(study, modality, int(rows[at]), str(groups[at]), found))
-        halves.append(html.card(f"{modality}: {len(asked)} of {len(rows)} rows" if known else modality, shown))
-    by, tasks, name = study.pack.spec.group_by, study.pack.spec.tasks, study.runs[0].path.name
-    whose = f" whose five nearest rows are mostly of another {tasks[0].name}" if known else ""
+            strips.append(_strip(study, modality, int(rows[at]), str(groups[at]), found))
+        title = f"{modality}: {(asked & wrong).sum()} of {len(shown)} rows" if known else modality
+        halves.append(html.card(title, strips))
+    by, name = pack.spec.group_by, study.runs[0].path.name
+    whose = f" whose nearest row of another {by} is of another {pack.spec.tasks[0].name}" if known else ""
     intro = (
-        f"{split} rows{whose}, drawn at random (seed 0). Left: the row. Then, best first, the five rows of other {by}s"
-        f" whose features of the same modality are nearest ({name})."
+        f"{split} rows{whose}, drawn at random (seed 0). Left: the row. Then, best first, the nearest row of each of the"
+        f" {num} nearest other {by}s of any split, by features of the same modality ({name})."
     )
     return [html.paragraph(intro[0].upper() + intro[1:]), html.grid(halves, "queries")]
 
