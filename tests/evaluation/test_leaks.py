@@ -126,6 +126,7 @@ def test_without_a_list_leaks_are_unknown(run: Path, turned: Pack) -> None:
     assert {r["leak"] for r in result["records"]} == {"unknown"} and "unknown" in result["leaks"][0]
     assert with_interval(0.5, 0.4, 0.6, "unknown") == "50.0 [40.0, 60.0] LEAK?"
     assert with_interval(-0.2, None, 0.9) == "-20.0 [-inf, 90.0]"  # R2 that is not known to any lower end
+    assert with_interval(0.8, None, 1 - 1e-16) == with_interval(0.8, None, 0.99999) == "80.0"  # of two groups
     assert with_interval(0.5, None, 1.0) == "50.0"  # one test group: no interval
 
 
