@@ -4,7 +4,6 @@ So do the how-to pages docs/add_a_dataset.md, and docs/encoders.md and policies.
 """
 
 import csv
-import os
 import shlex
 import sys
 from pathlib import Path
@@ -34,7 +33,6 @@ def run(page: Path, folder: Path, names: dict[str, Any] | None = None) -> None:
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(os, "cpu_count", lambda: 1)  # new processes take longer to start than these small packs
         run_cells(page, vars(sys.modules["__main__"]) if names is None else names)
 
 

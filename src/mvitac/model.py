@@ -206,7 +206,8 @@ class Model(nn.Module):
 
         An image is a path, a PIL image, an array [H, W, C] or a tensor [C, H, W] or [H, W, C]. Arrays and tensors are
         uint8 or float in [0, 1], RGB. Several images are a list of these, an array [N, H, W, C], or a tensor [N, C, H, W]
-        or [N, H, W, C]. They may have any size: they are resized like the training images.
+        or [N, H, W, C]. They may have any size: they are resized like the training images. If those were cropped, cut the
+        part out first (``spec.crop``, x:y:width:height).
 
         A model of windows (``spec.window``) takes clips: [F, H, W, C], oldest first, or a list of F images; several are a
         list of clips or an array [N, F, H, W, C]. Frames are ``spec.window.stride`` apart.
