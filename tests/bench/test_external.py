@@ -33,7 +33,6 @@ def test_frames_are_newest_first_and_the_oldest_is_repeated() -> None:
 
 TINY = "external:timm/mvitac_tiny,weights=random,size=32"
 
-
 ROWS = np.arange(6)
 
 

@@ -482,33 +482,23 @@ def table(out: Path) -> tuple[str, str]:
     return (out / "table.csv").read_text(), text[: text.index("| cost of one run")]
 
 
-def test_two_processes_share_the_runs_of_one_command(pack: Pack, tmp_path: Path) -> None:
-    plan = write_plan(tmp_path / "plan.json", 2, 1, 2)
-    finish(begin(main, command(pack, plan, tmp_path / "alone")))
-    shown = [tmp_path / "0.txt", tmp_path / "1.txt"]
-    for process in [begin(main, command(pack, plan, tmp_path / "shared"), output=file) for file in shown]:
-        finish(process)
-    assert table(tmp_path / "shared") == table(tmp_path / "alone")
-    texts = [file.read_text() for file in shown]
-    assert sum(text.count("s of training") for text in texts) == 2
-
-
 @pytest.mark.slow
-def test_killed_twice_and_resumed_gives_the_same_table(pack: Pack, tmp_path: Path) -> None:
-    """SIGKILL whenever so many log lines are written in all, then let it end."""
-    plan, out = write_plan(tmp_path / "plan.json", 2, 1, 4), tmp_path / "killed"
+def test_killed_and_shared_gives_the_same_table(pack: Pack, tmp_path: Path) -> None:
+    """One process is killed in its first run. Two others go on, and share the runs of the command."""
+    plan, out = write_plan(tmp_path / "plan.json", 2, 1, 8), tmp_path / "out"
     finish(begin(main, command(pack, plan, tmp_path / "straight")))
-    for goal in (2, 6):
-        process = begin(main, command(pack, plan, out))
-        while process.is_alive():
-            if sum(len(log.read_text().splitlines()) for log in out.glob("runs/*/*/log.jsonl")) >= goal:
-                process.kill()
-                process.join()
-                assert process.exitcode == -signal.SIGKILL
-            time.sleep(0.005)
-        assert not (out / "table.md").exists()
-    finish(begin(main, command(pack, plan, out), output=tmp_path / "shown.txt"))
-    assert "[2/2]" in (tmp_path / "shown.txt").read_text() and table(out) == table(tmp_path / "straight")
+    shown = [tmp_path / f"{i}.txt" for i in range(3)]
+    first = begin(main, command(pack, plan, out), output=shown[0])
+    while first.is_alive():
+        if sum(len(log.read_text().splitlines()) for log in out.glob("runs/*/*/log.jsonl")) >= 2:
+            first.kill()
+            first.join()
+        time.sleep(0.005)
+    assert first.exitcode == -signal.SIGKILL and not (out / "table.md").exists()
+    for process in [begin(main, command(pack, plan, out), output=file) for file in shown[1:]]:
+        finish(process)
+    assert sum(file.read_text().count("s of training") for file in shown) == 2
+    assert table(out) == table(tmp_path / "straight")
 
 
 def test_the_command_from_dry_run_to_tables(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

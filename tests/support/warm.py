@@ -10,7 +10,7 @@ import torch
 import mvitac.cli
 import mvitac.datasets
 import mvitac.deploy.export
-import mvitac.training.loop  # noqa: F401
+import mvitac.training.loop
 from mvitac.evaluation import controls
 
 for command in pkgutil.iter_modules(mvitac.cli.__path__, "mvitac.cli."):

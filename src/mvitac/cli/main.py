@@ -40,7 +40,6 @@ COMMANDS = {
 }
 """Command -> module of this package:function, imported when called."""
 
-
 HEAVY = ("demo", "pretrain", "finetune", "compare", "bench")
 """Commands whose options need torch. The others import it once their options are known to be right."""
 

@@ -10,9 +10,10 @@ import os
 import re
 import sys
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
+from unittest.mock import patch
 
 import tyro
 
@@ -47,7 +48,7 @@ def parse(
                 # A flag is shown in the one form that changes something; --x and --no-x are both accepted.
                 with _joined_lines(), contextlib.redirect_stdout(shown):
                     tyro.cli(kind, **options, config=(tyro.conf.FlagCreatePairsOff, tyro.conf.SuppressFixed))  # type: ignore[arg-type]
-            with _columns("10000"):  # the lines of an error must not be wrapped
+            with patch.dict(os.environ, COLUMNS="10000"):  # the lines of an error must not be wrapped
                 return tyro.cli(kind, **options)  # type: ignore[arg-type]
     except SystemExit as exit_:
         if not exit_.code:  # what has no default, or may be left out, need not be said
@@ -71,8 +72,7 @@ def _for_both(argv: Sequence[str]) -> list[str]:
     return found
 
 
-@contextlib.contextmanager
-def _joined_lines() -> Iterator[None]:
+def _joined_lines() -> Any:
     """Let tyro wrap field docstrings itself: it keeps the line breaks of the source, and has no option for that."""
     from tyro import _docstrings
 
@@ -82,23 +82,7 @@ def _joined_lines() -> Iterator[None]:
         text = read(*arguments)
         return text and re.sub(r"(?<!\n)\n(?!\n)", " ", text)
 
-    _docstrings.get_field_docstring = joined
-    try:
-        yield
-    finally:
-        _docstrings.get_field_docstring = read
-
-
-@contextlib.contextmanager
-def _columns(width: str) -> Iterator[None]:
-    old = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = width
-    try:
-        yield
-    finally:
-        del os.environ["COLUMNS"]
-        if old is not None:
-            os.environ["COLUMNS"] = old
+    return patch.object(_docstrings, "get_field_docstring", joined)
 
 
 def selectors(argv: list[str], names: Sequence[str]) -> tuple[dict[str, str], list[str]]:

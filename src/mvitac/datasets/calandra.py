@@ -45,7 +45,6 @@ TASKS = {
 }
 Ask = Literal["during", "before", "after", "authors"]
 
-
 _TEST = """international_travel_adapter 3d_printed_blue_connector soft_zebra fake_flower_in_pot metal_can french_dip
 metal_cylinder_with_holes soft_beer_bottle_holder"""
 _TRAIN = """cinnamon potato aspirin red_turtle happy_fall_stone monster_truck soft_red_cube lime ogx_shampoo peanut_butter

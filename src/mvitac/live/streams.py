@@ -19,7 +19,6 @@ from mvitac.system.files import brief
 FROZEN_AFTER, RETRY_EVERY = 1.0, 1.0
 """Seconds: how long pictures may be identical to the last byte, and between two tries to open a lost device."""
 
-
 _RECOVERED = {"unplugged": "back", "stalled": "running again", "frozen": "moving again"}  # a fault, and its end
 
 
