@@ -13,7 +13,6 @@ from mvitac.data import video
 from mvitac.data.video import frames, num_frames
 from support.videos import edited, numbered, read_number, write_video
 
-REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "touch_and_go_sample"
 NUM = 150
 KINDS: dict[str, tuple[str, dict[str, Any]]] = {
     "mpeg4": ("v.mp4", {}),
@@ -237,14 +236,3 @@ def test_files_that_are_no_videos(tmp_path: Path) -> None:
             container.mux(packet)
     with pytest.raises(ValueError, match="holds no video"):
         num_frames(tmp_path / "sound.mp4")
-
-
-@pytest.mark.skipif(not REAL.is_dir(), reason="the real recordings are not here")
-def test_real_gelsight_videos() -> None:
-    for path in sorted(REAL.glob("*/gelsight.mp4")):
-        times = np.load(path.with_name("time2.npy"))
-        assert num_frames(path) == len(times)
-        with av.open(str(path)) as container:
-            plain = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-        for number, image in frames(path, (5, 6, 100, 137, len(times) - 1)):
-            assert np.array_equal(image, plain[number])
