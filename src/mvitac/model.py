@@ -10,7 +10,7 @@ Shapes: N or B images, C channels, H x W pixels, D features, E dimensions of the
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -21,15 +21,25 @@ from mvitac.methods.base import Method
 from mvitac.nn.encoders import num_features, timm_trunk
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.nn.weights import misfit, read_model, safetensors_digest, write_model
-from mvitac.registry import from_json, to_json
+from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run
 from mvitac.system.files import brief, digest, parse_json
+from mvitac.system.sealed_folder import SealedFolder
 from mvitac.transforms.preprocess import ImageInput, Preprocess, check_images, encoder_input, resized, to_array
 
 ABOUT = ("run", "spec", "stored")  # texts in the header of a file of weights
 MAX_STORED = 1024  # px: no pack holds larger images (``data.storage``)
 BEST = "model.best.safetensors"  # weights of a run that were best on split val, kept with ``Run.eval_every``
 Which = Literal["last", "best"]
+ARTIFACT = SealedFolder(
+    "artifact.json",
+    "mvitac-artifact",
+    2,
+    "mvitac publish",
+    required=frozenset(("model.safetensors", "run.json")),
+    optional=frozenset(("probes.safetensors", "trained_on.safetensors", "README.md")),
+)
+"""What ``mvitac publish`` writes (``deploy.artifact``)."""
 EMBED_BATCH = 64  # images that ``Model.embed`` passes through an encoder at once: 0.5 GB with ResNet-18 at 224 px
 
 
@@ -321,6 +331,8 @@ def tensors_of(network: nn.Module) -> dict[str, Tensor]:
 
 def weights_file(folder: Path, which: Which) -> Path:
     """The file of a run's weights; ValueError if the best ones were not kept."""
+    if which not in get_args(Which):
+        raise unknown("weights", which, get_args(Which))
     if which == "best" and not (folder / BEST).is_file():
         raise ValueError(f"{folder} has no {BEST}: train with --eval-every N to keep the best weights, or use the last")
     return folder / (BEST if which == "best" else "model.safetensors")
@@ -345,6 +357,8 @@ def load(path: str | Path, which: Which = "last") -> Model:
         if inside := sorted(file.parent for file in path.glob("*/model.safetensors")):
             hint = f"; there is one at {inside[0]}"
         raise ValueError(f"no trained model at {file}{hint}")
+    if foreign := (file.parent / ARTIFACT.name).exists():
+        ARTIFACT.read(file.parent)
     header, tensors = read_model(file, ABOUT)
     try:
         run = Run.load(parse_json(header["run"]))
@@ -362,7 +376,7 @@ def load(path: str | Path, which: Which = "last") -> Model:
             if why := misfit(fresh(empty, spec, stored).state_dict(), tensors):
                 raise ValueError(f"{file} holds other weights than its run describes: {why}")
         model = fresh(empty, spec, stored)
-    model.foreign = (file.parent / "artifact.json").exists()
+    model.foreign = foreign
     if model.foreign and run.init:
         run = replace(run, init=replace(run.init, path=None, digest=run.init.digest or "unknown"))
     model.run = run

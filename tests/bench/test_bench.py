@@ -289,6 +289,12 @@ FORGED: dict[str, tuple[Change, str]] = {
     "rows": (put(*RECORDS, 0, "sums", "n", value=lambda sizes: [2 * n for n in sizes]), "is scored on other rows"),
     "weights twice": (put("encoder", value=lambda e: e | {"seeds": [0, 1], "weights": 2 * e["weights"]}), "has 1 wei"),
     "group twice": (put("blocks", 0, "groups", value=lambda names: [*names[:-1], names[0]]), "a group is there twice"),
+    "field": (put("mine", value=1), "has the unknown field 'mine'"),
+    "field of a block": (put("blocks", 0, "mine", value=1), "has the unknown field 'mine'"),
+    "excuse": (
+        put("blocks", 0, "left_out", value={"vision": "the encoder has no vision"}),
+        "the encoder has no vision",
+    ),
     "nothing": (lambda value: [not_run(block) for block in value["blocks"]], "was run on no task"),
     "twice": (put(*RECORDS, value=lambda records: [*records, records[0]]), "is there twice"),
     "modality": (lambda value: drop(value, source="", modality="both"), f"lacks the encoder, both, {FEW}, 0"),

@@ -242,6 +242,8 @@ def test_an_encoder_is_probed_beside_a_run(smoke_run: Path, pack: Pack) -> None:
             probe_runs([smoke_run], config, pack, **bad)
     with pytest.raises(ValueError, match="--on PACK"):
         probe_runs([], config, encoders=[TINY])
+    with pytest.raises(ValueError, match="unknown probe 'l': choose from linear, paper, knn"):
+        ProbeConfig(probes="linear")  # type: ignore[arg-type]
 
 
 def test_non_commercial_licences() -> None:

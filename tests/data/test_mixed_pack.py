@@ -166,7 +166,9 @@ class Turned(Slice):
 
 def test_a_group_on_two_sides_is_refused_or_marked(pack: Pack, tmp_path: Path) -> None:
     turned = built(Turned(num=60), tmp_path / "p")
-    with pytest.raises(ValueError, match=r"instance '0-6' is in train of part b and in test of part a, one of \d+"):
+    with pytest.raises(
+        ValueError, match=r"instance '0-6' is in train or val of part b and in test of part a, one of \d+"
+    ):
         MixedPack({"b": turned, "a": pack})
     mix = MixedPack({"a": pack, "b": turned}, allow_leak=True)
     assert mix.spec.notes[0].startswith("instance")
@@ -183,7 +185,9 @@ def test_a_leak_between_a_mix_and_a_pack_is_found(pack: Pack, gel: Pack) -> None
 
 def test_an_image_on_two_sides_under_two_names_is_refused(pack: Pack, tmp_path: Path) -> None:
     turned = built(Turned(num=60, prefix="copy "), tmp_path / "p")
-    expected = r"the vision image of row 'copy 0\d+' is in train of part a and in test of part b, one of \d+: pack"
+    expected = (
+        r"the vision image of row 'copy 0\d+' is in train or val of part a and in test of part b, one of \d+: pack"
+    )
     with pytest.raises(ValueError, match=expected):
         MixedPack({"a": pack, "b": turned})
     small = built(Turned(num=60, prefix="copy "), tmp_path / "small", size=16)

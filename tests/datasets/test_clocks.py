@@ -177,6 +177,7 @@ def own_times(name: str, *lines: object) -> Callable[[Path], None]:
         (spoil(36, Fz=lambda _: "1 N"), r"row 36: Fz is '1 N', which cannot be interpolated"),
         (spoil(36, stamp=lambda _: "then"), r"force\.csv, column stamp: 'then' is no time: give seconds"),
         (own_times("txt", *range(30), 20, *range(31, 50)), r"gel_timestamps\.txt: time 31 is before the one above it"),
+        (own_times("txt", *range(49), float("nan")), r"gel_timestamps\.txt: 'nan' is no time"),
         (own_times("txt", *range(49)), r"gel_timestamps\.txt has 49 times, gel\.mp4 has 50 frames"),
     ],
 )
@@ -191,6 +192,8 @@ def test_logs_that_would_give_wrong_numbers(tmp_path: Path, change: Callable[[Pa
     [
         ({"log": ("force.csv",)}, r"log 'force\.csv': write FILE:COLUMN"),
         ({"log": ("force:stamp",)}, r"force cannot be read as a table: it is no file of \.csv"),
+        ({"log": ("force.csv:stamp",), "labels": ("gel",)}, "column 'gel' holds images, not text or numbers"),
+        ({"log": ("twice.csv:t-1",)}, r"has a column 't-1', which reads as 't' and a shift: rename it"),
         ({"log": ("pipe.csv:stamp",)}, r"pipe\.csv cannot be read as a table: it is no file of"),
         ({"log": ("force.csv:stamp", "force.csv:stamp")}, r"both have a column 'Fz': rename one"),
     ],
@@ -198,6 +201,7 @@ def test_logs_that_would_give_wrong_numbers(tmp_path: Path, change: Callable[[Pa
 def test_logs_that_cannot_be_joined(tmp_path: Path, options: dict[str, Any], says: str) -> None:
     root = recorded(tmp_path / "set", num=1)
     os.mkfifo(root / "0/pipe.csv")  # reading it would wait for ever
+    write_csv(root / "0/twice.csv", **{"t": [0, 1], "t-1": [1, 2]})
     with pytest.raises(ValueError, match=says):
         packed(root, tmp_path / "p", **{**LOG, **options})
 
@@ -206,8 +210,12 @@ def test_rows_with_one_stamp_are_counted(tmp_path: Path) -> None:
     root = recorded(tmp_path / "set", num=2)
     spoil(36, stamp=lambda _: "0.34")(root)
     spoil(37, 38, stamp=lambda _: "0.39")(root)
-    note = next(note for note in packed(root, tmp_path / "p", **LOG).spec.notes if "joined" in note)
+    own_times("txt", *(round(0.04 * i, 1) for i in range(50)))(root)
+    pack = packed(root, tmp_path / "p", **LOG)
+    note = next(note for note in pack.spec.notes if "joined" in note)
     assert "of its rows have the stamp of another, of which one counts" in note
+    for i in np.flatnonzero(pack.column("recording") == "0"):  # frames of one stamp are themselves
+        assert abs(pack.images["touch"][i].mean() - shade(int(pack.column("frame")[i]), 0)) < 6
 
 
 def test_stamps_are_seconds_whatever_their_unit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -325,6 +333,5 @@ def test_the_check_finds_shifts_of_real_grasps(tmp_path: Path) -> None:
         found = time_shift(moved, looks)
         size = re.search(r"values come ([\d.]+) rows .* (late|early)", found.evidence)
         told[shift] = found.verdict, size and (1 if size[2] == "late" else -1) * float(size[1])
-        print(shift, found.evidence)
     assert [verdict for verdict, _ in told.values()] == ["ok", "ok", "look", "look", "look", "look", "look"]
     assert all(abs(told[shift][1] - 30 * shift) <= 1 for shift in (-0.2, 0.5, -0.5, 1.0)), told

@@ -496,6 +496,7 @@ BAD: dict[str, tuple[Change | None, dict[str, Any], str]] = {
     "one group": (each(object="a"), {}, r"assigning 1 groups gives label 'material' no rows in test"),
     "control with gaps": (one(4, width=""), {"controls": ("w=width",)}, r"row 4 .*control column 'width' is ''"),
     "id twice": (each(id="a"), {}, r"id 'a' occurs in several rows"),
+    "crop of half a pixel": (None, {"crop": ("left=0:0:.5:5",)}, "'left=0:0:.5:5': write COLUMN=x:y:width:height"),
     "vision is touch": (None, {"touch": ("vision",)}, r"column .vision. would be both vision and touch"),
     "vision is touch in one row": (one(4, left="./vision/03.png"), {}, r"row 4 .*has one image in two of the columns"),
 }
@@ -517,6 +518,7 @@ def test_bad_manifests_are_named_before_anything_is_written(tmp_path: Path, rows
 BAD_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
     "shares": ({"test_share": 0.6, "val_share": 0.4}, "leave nothing to train on"),
     "control named like ours": ({"controls": ("border=width",)}, "'border' is always computed"),
+    "mean": ({"controls": ("mean=width",)}, "'mean' is always computed"),
     "condition": ({"only": ("seq",)}, "condition 'seq': write column=value"),
 }
 
@@ -531,6 +533,7 @@ def test_bad_options_are_named_at_once(name: str) -> None:
 BAD_FILES: dict[str, tuple[str, bytes, str]] = {
     "ragged": ("m.csv", b"vision,touch\na,b\na,b,c\n", "row 2 has 3 cells for 2 columns"),
     "header twice": ("m.csv", b"vision,vision\na,b\n", "two columns of one name"),
+    "key twice": ("m.jsonl", b'{"vision": "a", "touch": "b", "touch": "c"}', "two entries of one name"),
     "latin-1": ("m.csv", "vision,touch\nMöbel,b\n".encode("latin-1"), "cannot be read as a table: 'utf-8' codec"),
 }
 

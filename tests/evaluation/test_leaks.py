@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,6 +33,7 @@ from mvitac.evaluation.leaks import (
     UNKNOWN,
     Scored,
     file_source,
+    leak_mark,
     leaks_of,
     read_sources,
     source_of,
@@ -118,6 +120,24 @@ def test_a_forgotten_group_is_told_below_scores(pack: Pack, tmp_path: Path, caps
     assert f"note: {warning}" in " ".join(capsys.readouterr().out.split())
     assert warning in write_report([tmp_path / "run"], tmp_path / "report", quiet=True).read_text()
     assert warning in (publish(tmp_path / "run", tmp_path / "art") / "README.md").read_text()
+
+
+def test_a_split_that_leaks_marks_every_score(run: Path, pack: Pack) -> None:
+    own = copy(pack)
+    sides = pa.array(np.where(np.arange(pack.num) % 2 == 0, "test", "train"))
+    own.table = pack.table.set_column(pack.table.column_names.index("split"), "split", sides)
+    session = ProbeConfig(tasks=("pattern",), modalities=("touch",))
+    result = probe_runs([run], session, own, allow_leak=True)
+    assert {leak_mark(record["leak"]) for record in (*result["records"], *result["retrieval"])} == {" LEAK"}
+    assert result["leaks"][0] == "60 of 60 test instances are also in train: this split leaks"
+
+
+def test_an_artifact_with_another_list_is_refused(run: Path, turned: Pack, tmp_path: Path) -> None:
+    """That of a run which learned from other rows would hide a leak."""
+    found = publish(run, tmp_path / "art")
+    (found / FILE).write_bytes((found / "run.json").read_bytes())
+    with pytest.raises(ValueError, match="does not match its digest: copy it again"):
+        probe_runs([found], ProbeConfig(controls=False), turned)
 
 
 def test_without_a_list_leaks_are_unknown(run: Path, turned: Pack) -> None:

@@ -59,10 +59,10 @@ def tuned(ancestor: Path, pack: Pack, tmp_path_factory: pytest.TempPathFactory) 
 def test_the_result_is_a_model_like_any_other(ancestor: Path, pack: Pack, tuned: Path) -> None:
     result = json.loads((tuned / "scores.json").read_text())
     found = {(r["source"], r["fraction"]): r for r in result["records"]}
-    assert set(found) == {(s, f) for s in ("fine-tuned, all", SCRATCH, FROZEN) for f in (40.0, 100.0)}
+    assert set(found) == {(s, f) for s in ("fine-tuned", SCRATCH, FROZEN) for f in (40.0, 100.0)}
     model = load(tuned / "seed0")
     (own,) = [r for r in probe_model(model, pack, pack.spec.tasks[:1], ["both"], []) if r["probe"] == "own"]
-    assert found["fine-tuned, all", 100.0]["group_correct"] == own["group_correct"]
+    assert found["fine-tuned", 100.0]["group_correct"] == own["group_correct"]
     assert result["models"] == [str(tuned / "seed0")] and result["leaks"] == []
     run, record = load_run(tuned / "seed0")
     assert run.init.path == ancestor and record["start"]["taken"] == {"vision": ["trunk"], "touch": ["trunk"]}
@@ -84,10 +84,10 @@ def test_the_command_continues_a_finished_one_and_prints_one_table(
     cells = [re.split("  +", line) for line in said.splitlines() if line.count("[") == 2]
     rows = {name: scores for name, *scores in cells}
     gains = [f"gain over {SCRATCH}", f"gain over {FROZEN}"]
-    assert list(rows) == ["fine-tuned, all", SCRATCH, FROZEN, *gains]
+    assert list(rows) == ["fine-tuned", SCRATCH, FROZEN, *gains]
     assert "40 % of instances" in said and "100 % of instances" in said and f"mvitac publish {tuned / 'seed0'}" in said
     numbers = {name: float(cells[1].split()[0]) for name, cells in rows.items()}
-    assert numbers[gains[0]] == pytest.approx(numbers["fine-tuned, all"] - numbers[SCRATCH], abs=0.11)
+    assert numbers[gains[0]] == pytest.approx(numbers["fine-tuned"] - numbers[SCRATCH], abs=0.11)
 
 
 def test_a_trunk_of_others_is_a_start_too(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,7 +102,7 @@ def test_a_trunk_of_others_is_a_start_too(pack: Pack, tmp_path: Path, monkeypatc
     result = tune(start, pack, tmp_path / "out", replace(ASKED, lr=(1e-3,), steps=(4,)), say=said.append)
     assert said[0] == "at most 2 trainings, 8 steps of 16" and said[1].startswith("100 %: fine-tuned")
     assert re.fullmatch(r"about \d+ s for all of them, by the first \d steps", said[2])
-    assert {r["source"] for r in result["records"]} == {"fine-tuned, all", SCRATCH, FROZEN}
+    assert {r["source"] for r in result["records"]} == {"fine-tuned", SCRATCH, FROZEN}
     assert {r["leak"] for r in result["records"] if r["source"] == SCRATCH} == {""}
     assert {r["leak"] for r in result["records"] if r["source"] != SCRATCH} == {UNKNOWN}
     assert load_run(tmp_path / "out" / "seed0")[0].encoder.touch.weights.endswith("w.safetensors")
@@ -220,7 +220,7 @@ def test_a_leak_of_the_ancestor_stands_beside_the_score(ancestor: Path, pack: Pa
     asked = replace(ASKED, lr=(1e-3,), allow_leak=True)
     records = tune(ancestor, Pack(seen), tmp_path / "out", asked)["records"]
     leaks = {r["source"]: r["leak"] for r in records}
-    assert "72 of 72 test rows" in leaks["fine-tuned, all"] and "72 of 72" in leaks[FROZEN] and leaks[SCRATCH] == ""
+    assert "72 of 72 test rows" in leaks["fine-tuned"] and "72 of 72" in leaks[FROZEN] and leaks[SCRATCH] == ""
     scratch = tmp_path / "out" / "scratch" / "seed0"  # saw its own train alone, which the other split tests
     with pytest.raises(ValueError, match=r"has seen what .* (\d+) of \1 test rows"):
         check_unseen([scratch], pack, pack.spec.tasks, allow_leak=False)

@@ -16,23 +16,12 @@ from mvitac.evaluation.probe import probe_model, split_rows
 from mvitac.methods.base import Views
 from mvitac.methods.calandra import CalandraConfig
 from mvitac.methods.supervised import SupervisedConfig, ValueHead
-from mvitac.model import fresh, load
+from mvitac.model import load
 from mvitac.run import Optim
 from mvitac.training.loop import train
 from mvitac.training.views import values_of
 from support.small_methods import TINY
-from support.training_runs import smoke, train_twice
-
-
-def test_heads_alone_leave_the_trunks_as_they_were(pack: Pack, tmp_path: Path) -> None:
-    """Weights and statistics of BatchNorm; from another run's weights it is a linear probe."""
-    method = SupervisedConfig(train="head", share=0.7)
-    run = smoke(pack, method=method, steps=6, checkpoint_every=2, eval_every=0, optim=Optim(name="adamw", lr=3e-3))
-    start, end = fresh(run, pack.spec, pack.size), load(train_twice(run, tmp_path, cut=3))
-    before, after = start.encoders.state_dict(), end.encoders.state_dict()
-    assert all(torch.equal(value, after[name]) for name, value in before.items())
-    heads = zip(start.classifiers.parameters(), end.classifiers.parameters(), strict=True)
-    assert not any(torch.equal(a, b) for a, b in heads)
+from support.training_runs import smoke
 
 
 def groups_of(pack: Pack, rows: np.ndarray) -> set[str]:

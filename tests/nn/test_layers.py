@@ -170,20 +170,6 @@ def test_patches_are_those_that_the_vit_embeds() -> None:
     torch.testing.assert_close(embedded, vit.patch_embed(images).flatten(1, 2), rtol=1e-4, atol=1e-5)
 
 
-def slow(seed: int, stream: int, row: int, i: int) -> float:
-    """SplitMix64 in Python's integers."""
-    golden, mask = 0x9E3779B97F4A7C15, (1 << 64) - 1
-
-    def mixed(x: int) -> int:
-        x = (x + golden) & mask
-        x = ((x ^ (x >> 30)) * 0xBF58476D1CE4E5B9) & mask
-        x = ((x ^ (x >> 27)) * 0x94D049BB133111EB) & mask
-        return x ^ (x >> 31)
-
-    key = mixed(mixed(mixed(seed) + stream) + row)
-    return (mixed(key + i * golden) >> 40 & 0xFFFFFF) / (1 << 24)
-
-
 def test_numbers_of_rows_are_uniform_and_a_function_of_seed_stream_and_row() -> None:
     rows = torch.arange(200)
     u = row_uniform(torch.tensor(5), rows, 500, 0)
@@ -194,7 +180,6 @@ def test_numbers_of_rows_are_uniform_and_a_function_of_seed_stream_and_row() -> 
         assert abs(float(torch.corrcoef(torch.stack([a.flatten(), b.flatten()]))[0, 1])) < 0.015
     assert torch.equal(row_uniform(torch.tensor(5), rows[7:9], 500, 0), u[7:9])
     assert not torch.equal(row_uniform(torch.tensor(5), rows, 500, 1), u)
-    assert row_uniform(torch.tensor(2**62), rows[3:4], 2, 1).tolist()[0] == [slow(2**62, 1, 3, i) for i in (0, 1)]
 
 
 def test_positions_are_sines_and_cosines_of_row_and_column() -> None:

@@ -65,30 +65,17 @@ def test_weights_decide_what_is_drawn(parts: dict[str, str]) -> None:
     assert {len(set(batch)) for batch in found.tolist()} == {8}  # no row is its own negative, where a pass ends either
 
 
-@pytest.mark.parametrize("sampler", ["shuffle", "one-per-touch", "spread"])
-def test_batches_of_one_part(parts: dict[str, str], sampler: Any) -> None:
-    run = mix_run(f"{parts['a']}:1", f"{parts['gel']}:1", batch_size=6, sampler=sampler, data={"batches": "one-part"})
-    pack, found = drawn(run, epochs=20)
-    kinds = pack.part_of[found]
-    assert (kinds == kinds[:, :1]).all() and 0.35 < kinds[:, 0].mean() < 0.65
-    if sampler != "shuffle":
-        assert np.mean([len(set(pack.touch_groups[batch])) for batch in found]) > 5.5
-
-
-@pytest.mark.parametrize("kind", ["mixed", "one-part"])
-def test_stopped_and_resumed_equals_straight(parts: dict[str, str], tmp_path: Path, kind: Any) -> None:
+def test_stopped_and_resumed_equals_straight(parts: dict[str, str], tmp_path: Path) -> None:
     """With a part that lacks the camera; across a change of epoch; scores of every part are logged."""
     given = (f"{parts['a']}:1", f"{parts['gel']}:2")
-    run = mix_run(*given, data={"batches": kind}, steps=8, checkpoint_every=2, log_every=1)
+    run = mix_run(*given, steps=8, checkpoint_every=2, log_every=1)
     out = train_twice(run, tmp_path, cut=5)
     lines = [json.loads(line) for line in (tmp_path / "straight" / "log.jsonl").read_text().splitlines()]
     values = next(line["eval"] for line in reversed(lines) if "eval" in line)
     shown = {"a vision/linear pattern", "a touch/linear a/bright", "a vision->touch R@5", "gel touch/linear pattern"}
     assert shown <= values.keys()
     assert not any(name.startswith("gel") and "vision" in name for name in values)
-    seen = {frozenset(line) & {"vv", "tt", "vt", "tv"} for line in lines if "loss" in line}
-    assert seen == ({frozenset(("vv", "tt", "vt", "tv")), frozenset(("tt",))} if kind == "one-part" else seen)
-    other = mix_run(f"{parts['a']}:1", f"{parts['gel']}:3", data={"batches": kind}, steps=8)
+    other = mix_run(f"{parts['a']}:1", f"{parts['gel']}:3", steps=8)
     with pytest.raises(ValueError, match="holds a different run"):
         train(other, out, resume=True, quiet=True)
 
@@ -192,14 +179,13 @@ def test_what_a_mix_cannot_do_is_refused(parts: dict[str, str], tmp_path: Path) 
     ragged = (parts["a"], parts["gel"])
     many = "part b has 24 rows to train on, for 32 of a batch of 36: a row would be its own negative"
     cases: list[tuple[Any, str]] = [
-        (mix_run(*ragged, batch_size=8, chunk=4), "in mixed batches, support neither several processes nor --chunk"),
+        (mix_run(*ragged, batch_size=8, chunk=4), "lack a modality support neither several processes nor --chunk"),
         (mix_run(*ragged, batch_size=2), "batch_size 2: parts that lack a modality need at least 3"),
         (mix_run(f"{parts['a']}:1", f"{parts['b']}:8", batch_size=36), many),
     ]
     for run, message in cases:
         with pytest.raises(ValueError, match=message):
             train(run, tmp_path / "run", quiet=True)
-    train(mix_run(*ragged, batch_size=8, chunk=4, steps=1, data={"batches": "one-part"}), tmp_path / "run", quiet=True)
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -35,6 +35,8 @@ VOLATILE = ("digest", "about")  # fields that the digest leaves out
 KEY = ("source", "seed", "modality", "probe")
 COUNTS = ("n", "correct")  # sums per group of classes: rows, and those that are right
 ABOUT_ROWS = ("n", "value", "squared_value")  # sums that depend on the rows alone
+FIELDS = ("format", "format_version", "suite", "suite_digest", "encoder", "versions", "blocks", *VOLATILE)
+BLOCK = ("set", "task", "not_run", "form", "data", "group_by", "groups", "leaks", "left_out", "records", "notes")
 GUESS = "majority or mean"  # what the page calls these two controls
 MAX_NAME = 200
 
@@ -142,6 +144,8 @@ def problems(value: dict[str, Any]) -> list[str]:
     """What is missing in a result, or cannot be, in one line each: tasks, scores, controls, sums, data."""
     suite, encoder = suite_of(value), value["encoder"]
     found = list(problems_of(encoder, (*CONTROLS, GUESS)))
+    for fields, known in ((value, FIELDS), *((block, BLOCK) for block in value["blocks"])):
+        found += [f"has the unknown field {name!r}" for name in sorted(fields.keys() - {*known})]
     asked = [(one, ask) for one in suite.sets for ask in one.tasks]
     if (want := [(s.name, t.name) for s, t in asked]) != (have := [(b["set"], b["task"]) for b in value["blocks"]]):
         return [*found, f"has the tasks {have}, the suite asks for {want}"]
@@ -149,6 +153,7 @@ def problems(value: dict[str, Any]) -> list[str]:
     if len(trunks) != 1:
         found.append("has the control imagenet in some tasks only" if trunks else "was run on no task")
     for block, (one, ask) in zip(value["blocks"], asked, strict=True):
+        found += [f"{one.name}, {ask.name}: {text}" for text in _excuses(block, one, encoder)]
         if "not_run" not in block:
             found += [f"{one.name}, {ask.name}: {text}" for text in _of_block(block, suite, one, ask, encoder)]
     return found
@@ -170,6 +175,14 @@ def problems_of(encoder: dict[str, Any], controls: Sequence[str]) -> Iterator[st
     yield from (f"{key} is {number}" for key, number in numbers.items() if not 0 <= number < 1e18)
     if not len(seeds) == len(set(seeds)) == len(set(weights)) == len(weights):
         yield f"has {len(set(weights))} weights for seeds {seeds}"
+
+
+def _excuses(block: dict[str, Any], one: SuiteSet, encoder: dict[str, Any]) -> Iterator[str]:
+    """Reasons for a score that is not there, and that cannot be true."""
+    reads = {f"the encoder has no {modality}" for modality in encoder["parameters"]}
+    yield from {block.get("not_run", ""), *block.get("left_out", {}).values()} & reads
+    if not block.get("not_run", "the encoder").startswith("the encoder") and not any(form.at for form in one.forms):
+        yield f"simulated data is always there: {block['not_run']}"
 
 
 def _of_block(

@@ -26,14 +26,10 @@ STDOUT = Path("-")  # the --json FILE that means stdout
 def parse(
     kind: Callable[..., T] | type[T], argv: Sequence[str], prog: str, *, default: Any = None, description: str = ""
 ) -> T:
-    """Parse ``argv`` with tyro, and turn its boxed errors into a ValueError of one line.
+    """Parse ``argv``, the words after the command's name ``prog``, with tyro; its boxed errors become one ValueError.
 
-    Args:
-        kind: dataclass of the options; the docstring under each field is its help text.
-        argv: words after the command's name.
-        prog: the command's name, e.g. "data pack".
-        default: instance of ``kind`` with other defaults than its own.
-        description: text of ``--help`` above the options, instead of the docstring of ``kind``.
+    ``kind``: dataclass of the options; the docstring under each field is its help text, and ``default`` an instance with
+    other defaults. ``description``: text of ``--help`` above the options, instead of the docstring of ``kind``.
     """
     argv = _for_both(argv)
     options: dict[str, Any] = {"args": list(argv), "prog": f"mvitac {prog}"}

@@ -17,7 +17,7 @@ from mvitac.cli.options import check_json, check_models, loading, parse, printed
 from mvitac.data.images import decode, fit, side_by_side
 from mvitac.data.pack import Pack
 from mvitac.report.contact_sheet import draw
-from mvitac.system.files import check_place, write_atomic
+from mvitac.system.files import write_atomic
 from mvitac.system.progress import shown
 
 _SIDE = 160  # pixels: side of one picture of what was found
@@ -47,7 +47,7 @@ def embed(argv: list[str]) -> None:
     from mvitac.evaluation.evaluate import as_trained
     from mvitac.evaluation.sensors import about_new
 
-    check_place(options.out)
+    check_json(options.out, "--out")
     model = load(options.model)
     pack = as_trained(model, Pack(options.pack))
     with shown():

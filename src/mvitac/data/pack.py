@@ -112,7 +112,9 @@ class Pack:
 
         With ``splits``, labels of rows in other splits (column ``Task.split``) are -1, too.
         """
-        about = next(t for t in self.spec.tasks if t.name == task)
+        if task not in (tasks := {t.name: t for t in self.spec.tasks}):
+            raise unknown("task", task, tasks)
+        about = tasks[task]
         return self._known(about, splits, lambda: self.column(f"label_{task}").astype(np.int64), -1)
 
     def values(self, task: ValueTask, *splits: str) -> np.ndarray:
@@ -175,6 +177,18 @@ class Pack:
         for name, value in (only or {}).items():
             mask &= self.column(name).astype(str) == value
         return np.flatnonzero(mask)
+
+    def split_leaks(self, tasks: Sequence[AnyTask]) -> list[str]:
+        """Say of each split that ``tasks`` use how many of its test groups are in its train, too."""
+        groups, said = self.column("group").astype(str), []
+        for column in dict.fromkeys(("split", *(task.split for task in tasks))):
+            own = "" if column == "split" else f" of {' and '.join(t.name for t in tasks if t.split == column)}"
+            train, test = ({*groups[self.rows(split, by=column)]} for split in ("train", "test"))
+            if both := len(train & test):
+                said.append(
+                    f"{both} of {len(test)} test {self.spec.group_by}s{own} are also in train: this split leaks"
+                )
+        return said
 
     def with_splits(self, splits: "Mapping[str, Iterable[str]]") -> "Pack":
         """This pack with other cells in columns of splits."""

@@ -49,7 +49,6 @@ class MixedPack(_Several):
 
     Attributes:
         weights: How often each part is drawn in training, relative to the others; () = by its number of rows.
-        one_part: Whether all rows of a batch are of one part.
 
     Args:
         parts: Name -> pack, at least two.
@@ -62,7 +61,6 @@ class MixedPack(_Several):
     """
 
     weights: tuple[float, ...] = ()
-    one_part: bool = False
 
     def __init__(self, parts: Mapping[str, Pack], *, size: int = 0, allow_leak: bool = False) -> None:
         self.parts, packs = dict(parts), list(parts.values())
@@ -108,11 +106,6 @@ class MixedPack(_Several):
         drawn = np.array(self.weights) if self.weights else sizes
         return drawn / drawn.sum()
 
-    @property
-    def weighted(self) -> bool:
-        """Whether training draws from the parts otherwise than from one pack of all rows."""
-        return bool(self.weights) or self.one_part
-
     def alone(self, part: str) -> Pack:
         """This pack with the rows of all other parts hidden, and the modalities of ``part``."""
         inside = self.part_of == list(self.parts).index(part)
@@ -143,7 +136,7 @@ def _shared_by_parts(parts: Mapping[str, Pack]) -> str:
         learned = one.rows("train", "val", "unlabelled")
         scored = np.flatnonzero(np.any([other.column(c) == "test" for c in other.spec.split_columns], axis=0))
         hashes = list(zip(("id", "group"), row_hashes(one), row_hashes(other), strict=True))
-        where = f"is in train of part {a} and in test of part {b}, one of"
+        where = f"is in train or val of part {a} and in test of part {b}, one of"
         for column, ours, theirs in hashes[::-1]:
             both = scored[np.isin(theirs[scored], ours[learned])]
             if len(both):
@@ -323,15 +316,8 @@ def _side(pack: Pack, tasks: Tasks, part: str, keep: set[str]) -> pa.Table:
 
 
 def _columns(part: str, pack: Pack, taken: Iterable[str], prefixed: Mapping[str, str], tasks: Tasks) -> Columns:
-    """The columns of one part of several.
-
-    Args:
-        part: Name of the part.
-        pack: The part.
-        taken: Its columns that are taken over.
-        prefixed: New columns whose cells get the prefix ``<part>/`` -> those of the part.
-        tasks: By whose classes labels are numbered.
-    """
+    """The columns of one part of several: those ``taken`` over; labels, numbered by the classes of ``tasks``; and new ones,
+    ``prefixed``, whose cells are those of a column of the part after ``<part>/``."""
     columns: Columns = {name: pack.table.column(name) for name in taken}
     columns |= {new: _text(f"{part}/{cell}" for cell in pack.column(own).astype(str)) for new, own in prefixed.items()}
     columns["sensor"] = _text(np.array(pack.sensor_names)[pack.sensors])

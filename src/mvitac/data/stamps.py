@@ -1,5 +1,6 @@
 """Time stamps: the columns that have them, and their units."""
 
+import contextlib
 import math
 from collections.abc import Iterable
 from datetime import UTC, datetime
@@ -18,10 +19,11 @@ def seconds(cells: Iterable[str], where: object) -> np.ndarray:
     """
 
     def one(cell: str) -> float:
-        try:
-            return float(cell or math.nan)
-        except ValueError:
-            pass
+        if not cell:
+            return math.nan
+        with contextlib.suppress(ValueError):
+            if math.isfinite(number := float(cell)):
+                return number
         try:
             moment = datetime.fromisoformat(cell)
         except ValueError:

@@ -23,9 +23,6 @@ class MixConfig(DatasetConfig):
     parts: tuple[str, ...] = ()
     """The packs, each as NAME=FOLDER:WEIGHT, such as tag=packs/tag:2 mine=packs/mine:1. NAME is by default the folder's.
     WEIGHT is the part's share of the drawn rows relative to the others; by default a part's number of rows."""
-    batches: Literal["mixed", "one-part"] = "mixed"
-    """mixed: every batch has rows of all parts. one-part: each batch is of one part, so that no negative differs from the
-    query by its dataset or sensor."""
     size: int = 0
     """Side of the images in pixels; those of another side are resized when they are read. 0: the largest of the parts."""
     score_on: Literal["test", "val"] = "test"
@@ -68,7 +65,6 @@ class MixConfig(DatasetConfig):
             except ValueError as error:
                 raise ValueError(f"part {name}: {error}") from None
         pack = MixedPack(parts, size=self.size, allow_leak=self.allow_leak)
-        pack.one_part = self.batches == "one-part"
         pack.weights = tuple(weight for _, _, weight in given if weight is not None)
         return pack
 

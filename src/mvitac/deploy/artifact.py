@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from mvitac import model as models
-from mvitac.deploy.sealed_folder import SealedFolder
 from mvitac.evaluation.encoders import is_encoder, open_encoder
-from mvitac.model import Model
+from mvitac.model import ARTIFACT, Model
 from mvitac.nn.encoders import num_features
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.nn.weights import read_safetensors
@@ -25,14 +24,6 @@ from mvitac.registry import from_json, to_json
 from mvitac.shipped import named
 from mvitac.system.files import brief, fields_of
 
-ARTIFACT = SealedFolder(
-    "artifact.json",
-    "mvitac-artifact",
-    2,
-    "mvitac publish",
-    required=frozenset(("model.safetensors", "run.json")),
-    optional=frozenset(("probes.safetensors", "trained_on.safetensors", "README.md")),
-)
 AS_GIVEN = "none is subtracted: tactile images are used as the sensor gives them"
 SUBTRACTED = (
     "subtracted: touch is (touch - background) / 2 + 128, the background being the sensor without contact; `mvitac live`"

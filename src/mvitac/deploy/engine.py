@@ -20,9 +20,9 @@ import numpy as np
 import safetensors.numpy
 
 from mvitac.data.spec import listed
-from mvitac.deploy.sealed_folder import SealedFolder
 from mvitac.registry import from_json
 from mvitac.system.files import brief, fields_of
+from mvitac.system.sealed_folder import SealedFolder
 
 MODEL, CHECK = "model.onnx", "check.safetensors"
 EXPORT = SealedFolder("export.json", "mvitac-export", 3, "mvitac export", frozenset((MODEL, CHECK)))

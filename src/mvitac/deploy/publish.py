@@ -11,7 +11,7 @@ import torch
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, ValueTask
 from mvitac.datasets.simulated import SimulatedConfig
-from mvitac.deploy.artifact import ARTIFACT, preprocessing, read
+from mvitac.deploy.artifact import preprocessing, read
 from mvitac.deploy.card import card
 from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import as_trained, check_unseen, stored_result
@@ -21,7 +21,7 @@ from mvitac.evaluation.regressors import Linear
 from mvitac.evaluation.scores import summarise
 from mvitac.evaluation.sensors import sensors_of
 from mvitac.evaluation.value_scores import error_by_range
-from mvitac.model import Model, load
+from mvitac.model import ARTIFACT, Model, load
 from mvitac.nn.encoders import build_trunk
 from mvitac.nn.linear_probe import Error, LinearProbe, ProbeInfo, ValueInfo
 from mvitac.registry import to_json

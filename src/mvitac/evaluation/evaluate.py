@@ -99,13 +99,17 @@ def probe_runs(
         tested = [f"{session.folds} folds: every {pack.spec.group_by} that no run learned from is tested once"]
     else:
         (records, retrieval), tested = score(pack, others, tasks), []
+    said, split = leaks_of([*records, *retrieval]), [] if session.folds else pack.split_leaks(tasks)
+    for record in (*records, *retrieval) if split else ():
+        if record.get("leak", "") in ("", UNKNOWN):
+            record["leak"] = "; ".join(split)
     classes = {task.name: list(task.classes) for task in tasks if isinstance(task, Task)}
     result = {
         **{"data": pack.spec.name, "pack": pack.digest, "group_by": pack.spec.group_by},
         **{"notes": [*pack.spec.notes, *tested], "classes": classes},
         "targets": {task.name: to_json(task.targets) for task in tasks if isinstance(task, ValueTask)},
         **{"asked": to_json(session), "models": _digests(paths, weights)},
-        **{"encoders": [m.describe() for m, _ in others], "leaks": leaks_of([*records, *retrieval])},
+        **{"encoders": [m.describe() for m, _ in others], "leaks": [*split, *said]},
         **{"records": records, "retrieval": retrieval, "summary": summarise(records, session.probes[0])},
         "per_class": per_class(records, classes, session.probes[0]),
     }

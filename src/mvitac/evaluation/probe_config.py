@@ -1,9 +1,10 @@
 """``ProbeConfig``: what `mvitac probe` and ``mvitac.probe`` are asked to score. It imports no torch."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from mvitac.evaluation import few_labels
+from mvitac.registry import unknown
 
 Probe = Literal["linear", "paper", "knn"]
 Standardise = Literal["colours", "features"]
@@ -39,6 +40,10 @@ class ProbeConfig:
             for value in values:
                 if values.count(value) > 1:
                     raise ValueError(f"{name} {value!r} is given twice: give it once")
+        for name, known in (("probe", Probe), ("standardise", Standardise)):
+            for value in given[name]:
+                if value not in get_args(known):
+                    raise unknown(name, value, get_args(known))
         if not self.probes:
             raise ValueError("no probe given: choose from linear, paper, knn")
         if self.folds < 0 or self.folds == 1 or (self.folds and self.standardise):

@@ -124,12 +124,8 @@ class _Recoloured(Lazy):
 class RecolouredPack(JoinedPack):
     """A joined pack that also shows the touches of sensors that ``learn`` lacks in the colours of those that it has.
 
-    Attributes:
-        new: Numbers of the sensors that ``learn`` lacks.
-        looks: One pack for each known sensor (at most ``MAX_LOOKS``, those with the most rows), with its colours.
-
-    Raises:
-        ValueError: If ``learn`` has all sensors of ``score``, or the colours of a sensor cannot be learned.
+    ``new``: numbers of the sensors that ``learn`` lacks; ValueError if there are none, or colours cannot be learned.
+    ``looks``: one pack for each known sensor (at most ``MAX_LOOKS``, those with the most rows), with its colours.
     """
 
     def __init__(self, learn: Pack, score: Pack) -> None:

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import AnyTask
 from mvitac.evaluation.controls import Records, controls_of, frozen_trunks
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
 from mvitac.experiments.jobs import Job, Work
@@ -104,7 +103,7 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
         "pack": work.pack.digest,
         "group_by": work.pack.spec.group_by,
         "notes": [" ".join(note.split()) for note in work.pack.spec.notes],
-        "leaks": leaks(work.pack, chosen(work.pack, session)[0]),
+        "leaks": "; ".join(work.pack.split_leaks(chosen(work.pack, session)[0])),
         "records": [record for records, _ in scored for record in records] + controls,
         "retrieval": [record for _, retrieval in scored for record in retrieval] + found,
         "rows": [row.label for row in work.plan.rows if row.label not in work.left_out],
@@ -141,24 +140,6 @@ def _controls(work: Work, out: Path, session: ProbeConfig) -> tuple[Records, Rec
     records, retrieval = controls_of(runs, work.pack, tasks, modalities, session.probes)
     write_json(path, {"key": key, "records": records, "retrieval": retrieval}, sealed=True)
     return records, retrieval
-
-
-def leaks(pack: Pack, tasks: Sequence[AnyTask]) -> str:
-    """Describe leaks of each split that ``tasks`` use: groups in both train and test, and test rows used in pre-training.
-
-    Returns an empty string if there is none.
-    """
-    groups, said = pack.column("group").astype(str), []
-    for column in dict.fromkeys(("split", *(task.split for task in tasks))):
-        train, test = (pack.rows(split, by=column) for split in ("train", "test"))
-        own = "" if column == "split" else f" of {' and '.join(t.name for t in tasks if t.split == column)}"
-        shared, num = len(set(groups[train]) & set(groups[test])), len(set(groups[test]))
-        if shared:
-            said.append(f"{shared} of {num} test {pack.spec.group_by}s{own} are also in train: this split leaks")
-        seen = len(np.intersect1d(test, pack.rows("train", "unlabelled")))
-        if seen and column != "split":
-            said.append(f"{seen} of {len(test)} test rows{own} were pre-trained on")
-    return "; ".join(said)
 
 
 def cost(label: str, jobs: Sequence[Job], pack: Pack) -> dict[str, Any]:

@@ -40,7 +40,7 @@ from mvitac.training.loop import train
 from mvitac.training.setup import check_same
 from mvitac.transforms.random_views import Augment, ViewAugment
 
-FROZEN, SCRATCH = "frozen, linear probe", "from scratch"
+TUNED, FROZEN, SCRATCH = "fine-tuned", "frozen, linear probe", "from scratch"
 LIGHT = ViewAugment(scale=(0.8, 1.0), flip=0.0, grayscale=0.0)
 OPTIM = Optim(name="adamw", lr=1e-3, eps=1e-8, weight_decay=0.05, decay_norms=False, schedule="cosine", warmup=0.1)
 Records = list[dict[str, Any]]
@@ -56,8 +56,6 @@ class Finetuning:
     """Tasks with values to learn."""
     modalities: tuple[Literal["touch", "vision"], ...] = ()
     """Modalities to learn from. Default: all that the model and the data have."""
-    train: Literal["all", "head"] = "all"
-    """What is trained: encoders and new heads, or the heads alone."""
     lr: tuple[float, ...] = (3e-4, 1e-4, 1e-3, 3e-3)
     """Learning rates to try. The first is used where there are too few groups to choose."""
     steps: tuple[int, ...] = (200, 600)
@@ -76,6 +74,8 @@ class Finetuning:
     def __post_init__(self) -> None:
         if not (self.lr and self.steps and self.fractions and self.seeds > 0 and self.batch_size > 1):
             raise ValueError("give at least one of lr, steps, fractions and seeds, and a batch size of 2 or more")
+        if not all(0 < percent <= 100 for percent in self.fractions):
+            raise ValueError(f"fractions {self.fractions}: give percentages, above 0, at most 100")
 
 
 def finetune(
@@ -91,12 +91,9 @@ def finetune(
     """Fine-tune ``ancestor`` on the labels of ``data``, and score it with controls.
 
     ``ancestor``: a run or an artifact; "imagenet" or "imagenet:TRUNK"; or "TRUNK=FILE", other weights of a trunk of timm.
-    ``say`` is called with lines of progress, first a forecast. ValueError if the labels, the data and the model do not
-    fit together, or there are too few groups.
-
-    Returns:
-        The content of scores.json: "records", each with its "fraction"; "chosen" (fraction -> source -> settings);
-        "models" (folders of the fine-tuned models of the last fraction); "leaks".
+    ``say`` is called with lines of progress, first a forecast. Returns the content of scores.json: "records", each with its
+    "fraction"; "chosen" (fraction -> source -> settings); "models" (folders of those of the last fraction); "leaks".
+    ValueError if the labels, the data and the model do not fit together, or there are too few groups.
     """
     check_place(out / "scores.json")
     if out.exists() and any(out.iterdir()) and not resume:
@@ -107,7 +104,7 @@ def finetune(
     tasks = tuple(chosen(pack, ProbeConfig(tasks=names))[0])
     fitted = fitting(model, pack, asked.modalities or MODALITIES)
     modalities: Any = asked.modalities or fitted
-    method = SupervisedConfig(tasks=tuple(task.name for task in tasks), modalities=modalities, train=asked.train)
+    method = SupervisedConfig(tasks=tuple(task.name for task in tasks), modalities=modalities)
     modality = "both" if len(modalities) == 2 else modalities[0]
     job = _Job(asked, model, pack, _run_of(model, init, data, pack, method), tasks, modality, out, say, quiet)
     for task in tasks:
@@ -182,8 +179,6 @@ class _Job:
     def run_of(self, percent: float, seed: int, kind: str, settings: dict[str, Any], *, hold_out: bool = False) -> Run:
         """The run of ``kind`` on this share of the labels with this lr and number of steps."""
         method = self.method(percent, seed, hold_out=hold_out)
-        if kind == SCRATCH:
-            method = replace(method, train="all")
         size = max(2, min(self.asked.batch_size, len(method.training_rows(self.pack))))
         optim = replace(self.run.optim, lr=settings["lr"])
         run = replace(self.run, method=method, seed=seed, steps=settings["steps"], optim=optim, batch_size=size)
@@ -191,7 +186,7 @@ class _Job:
 
     @property
     def kinds(self) -> list[str]:
-        return [f"fine-tuned, {self.asked.train}", *([SCRATCH] if self.asked.from_scratch else [])]
+        return [TUNED, *([SCRATCH] if self.asked.from_scratch else [])]
 
     def forecast(self, step: int = 0, values: dict[str, float] | None = None) -> None:
         """Say how many steps there will be, and as a logger of the first training how long they take."""

@@ -57,16 +57,14 @@ def _any_printed(lines: Sequence[Line]) -> bool:
     return any(cell["printed"] is not None for line in lines for cell in line.cells.values())
 
 
-def _first_cells(line: Line) -> list[str]:
-    """The row's name and modality; controls are in italics."""
-    return [f"*{line.source}*" if line.control else line.source, "" if line.modality == "none" else line.modality]
-
-
 def _table(
     lines: Sequence[Line], reference: str, shown: bool, *, targets: bool = False
 ) -> tuple[list[str], list[list[str]]]:
     """Heads and rows of a table of ``lines``, with the paper's numbers if ``shown``, and the error of ``targets``."""
-    heads, rows = ["", "modality"], [_first_cells(line) for line in lines]
+    heads, rows = ["", "modality"], []
+    for line in lines:
+        name = f"*{line.source}*" if line.control else line.source  # in italics
+        rows.append([name, "" if line.modality == "none" else line.modality])
     for task, score in _columns(lines).items():
         heads += [f"{task} {'R2 ' * (score == 'R2')}%", *["error"] * targets, *["printed"] * shown, f"to {reference}"]
         for line, row in zip(lines, rows, strict=True):

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from mvitac.data.images import IMAGES, decode
-from mvitac.data.video import VIDEOS, frame_times, frames
+from mvitac.data.video import VIDEOS, frames
 from mvitac.sim.sensors import SENSORS
 from mvitac.system.files import brief
 
@@ -124,8 +124,11 @@ class Video(Recording):
 
     def open(self) -> None:
         if self.number < 0:
-            self.times = frame_times(self.path)
-            self.fps = float(1 / np.median(np.diff(self.times))) if len(self.times) > 1 else 30.0
+            from mvitac.datasets.table.clocks import times_of  # robots that read no video have no pyarrow
+
+            self.times = times_of(self.path)
+            seconds = float(np.ptp(self.times))
+            self.fps = (len(self.times) - 1) / seconds if seconds else 30.0
         self.number, self.lost = -1, {}
         self.left = frames(self.path, range(len(self.times)), lost=self.lost)
         self.next = next(self.left, None)

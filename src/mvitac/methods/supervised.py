@@ -110,8 +110,6 @@ class SupervisedConfig(LabelledConfig):
 
     name: ClassVar[str] = "supervised"
 
-    train: Literal["all", "head"] = "all"
-    """What is trained: trunks and heads, or the heads alone."""
     share: float = 1.0
     """Share of the labelled groups to learn from, drawn at random; at least one group of each class."""
     draw: int = 1
@@ -153,15 +151,14 @@ class SupervisedConfig(LabelledConfig):
     def build(self, spec: DataSpec, encoder: Encoders) -> "Supervised":
         trunks = {m: build_trunk(encoder[m], spec.channels(m), spec.frames(m)) for m in self.modalities_of(spec)}
         width = sum(num_features(trunk) for trunk in trunks.values())
-        return Supervised(trunks, self.heads(spec, lambda num: nn.Linear(width, num)), self.train == "all")
+        return Supervised(trunks, self.heads(spec, lambda num: nn.Linear(width, num)))
 
 
 class Supervised(Method):
-    """One head per task on the concatenated features. Trunks that are not trained keep their statistics, too."""
+    """One head per task on the concatenated features."""
 
-    def __init__(self, trunks: dict[str, nn.Module], classifiers: dict[str, nn.Module], trained: bool = True) -> None:
+    def __init__(self, trunks: dict[str, nn.Module], classifiers: dict[str, nn.Module]) -> None:
         super().__init__()
-        self.trained = trained
         self.trunks = nn.ModuleDict(trunks)
         # A list, because task names may contain characters that module names may not.
         self.tasks = tuple(classifiers)
@@ -178,16 +175,6 @@ class Supervised(Method):
             total = F.cross_entropy(head(features).float(), labels, ignore_index=-1, reduction="sum")
             losses[task] = total / (labels >= 0).sum().clamp(min=1)  # 0, not NaN, for a batch without labels
         return with_sum(losses)
-
-    def prepare(self, rows: Tensor) -> None:
-        if not self.trained:
-            self.trunks.requires_grad_(False)
-
-    def train(self, mode: bool = True) -> Self:
-        super().train(mode)
-        if not self.trained:
-            self.trunks.eval()
-        return self
 
     def learn_scale(self, values: dict[str, Tensor]) -> None:
         for task, head in zip(self.tasks, self.heads, strict=True):

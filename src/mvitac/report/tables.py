@@ -70,8 +70,8 @@ def print_summary(result: dict[str, Any], file: TextIO | None = None, *, probe: 
         if clipped := clipped_text(task):
             print(clipped, file=file)
     _print_notes(result, trained, file)
-    if few < 10:
-        hint = f"hint: {few} test {by}{'s' * (few > 1)} tell little: --folds 5 tests every {by} no run learned from"
+    if 1 < few < 10 and not result["asked"]["folds"]:
+        hint = f"hint: {few} test {by}s tell little: --folds {min(5, few)} tests every {by} no run learned from"
         print(textwrap.fill(hint, 80, subsequent_indent="  "), file=file)
 
 
@@ -177,7 +177,10 @@ def print_finetuning(result: dict[str, Any], file: TextIO | None = None) -> None
         (_, ours), *others = cells.items()
         score = "R2" if "r2" in next(iter(ours.values()))[0] else "accuracy"
         columns = [f"{score} %", *(f"{f:g} % of {result['group_by']}s" for f in ours)]
-        rows = [[source, *map(_score_text, found.values())] for source, found in cells.items()]
+        texts = {
+            s: [with_interval(*interval(each), leaks_in(each)) for each in found.values()] for s, found in cells.items()
+        }
+        rows = [[source, *(text.replace(" LEAK", "\nLEAK") for text in found)] for source, found in texts.items()]
         rows += [[f"gain over {s}", *(_gain_text(ours[f], found[f]) for f in ours)] for s, found in others]
         print(text_table(f"{result['data']}: {task}", columns, rows), file=file)
     _print_notes(result, result["records"], file)
@@ -188,10 +191,6 @@ def text_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]
     align = ["left"] * words + ["right"] * (len(columns) - words)
     table = tabulate(rows, columns, "simple", disable_numparse=True, colalign=align if rows else None)
     return f"{title}\n{table}\n"
-
-
-def _score_text(records: Sequence[dict[str, Any]]) -> str:
-    return with_interval(*interval(records), leaks_in(records)).replace(" LEAK", "\nLEAK")
 
 
 def _gain_text(ours: Sequence[dict[str, Any]], theirs: Sequence[dict[str, Any]]) -> str:

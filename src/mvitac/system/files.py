@@ -18,8 +18,10 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Let ``write`` fill a temporary file next to ``path``, then rename it, so that no reader sees a partial file.
 
     Missing folders are created. After an error (full disk, Ctrl-C) ``path`` is unchanged. It is flushed to disk, against
-    power loss. Temporary files that killed processes left are removed.
+    power loss. Temporary files that killed processes left are removed. A symbolic link stays one, and a device is refused.
     """
+    check_ordinary(path)
+    path = path.resolve() if path.is_symlink() else path
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_orphans(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
@@ -65,11 +67,17 @@ def naming(path: Path) -> Iterator[None]:
         raise
 
 
+def check_ordinary(path: Path) -> None:
+    """Raise ValueError if ``path`` is there and neither file nor folder: a rename would put a file in a device's place."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise ValueError(f"{path} is neither a file nor a folder: choose another place")
+
+
 def check_place(path: Path) -> None:
     """Raise ValueError if ``path`` cannot be written. Call it before the work whose result is written there."""
     parent = next(p for p in path.absolute().parents if os.path.lexists(p))
     try:
-        path.exists()  # raises OSError if the name is too long
+        check_ordinary(path)  # raises OSError if the name is too long
         with tempfile.TemporaryFile(dir=parent):
             pass
     except OSError as error:
@@ -131,9 +139,15 @@ def parse_json(text: str) -> Any:
         name = text[max(0, found.start() - 20) : found.end()]
         raise ValueError(f"control character in a name, {name!r}: rename it, a terminal would obey it")
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=_once)
     except RecursionError:
         raise ValueError("too many brackets inside each other") from None
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    if len(found := dict(pairs)) < len(pairs):
+        raise ValueError(f"two entries of one name: {', '.join(name for name, _ in pairs)}")
+    return found
 
 
 def digest(value: Any) -> str:

@@ -28,7 +28,7 @@ class Batches:
         self.rows, self.seed, self.shape = rows, run.seed, (run.steps_per_epoch(len(rows)), run.batch_size)
         self.touch_groups = pack.touch_groups[rows] if run.sampler != "shuffle" else None
         self.order: Order = partial(epoch_order, spread=run.sampler == "spread")
-        weighted = isinstance(pack, MixedPack) and pack.weighted
+        weighted = isinstance(pack, MixedPack) and bool(pack.weights)
         self._epoch = lru_cache(2)(PartOrder(self, pack).epoch if weighted else self._pass)  # type: ignore[arg-type]
 
     def __getitem__(self, step: int) -> np.ndarray:
@@ -43,9 +43,9 @@ class Batches:
 class PartOrder:
     """Rows of each epoch of a mix whose parts are drawn by weight.
 
-    An epoch draws as many rows as it has room for. Each draw is of a random part, by weight: a row, or a whole batch if
-    batches are of one part. It takes the next rows of that part's endless sequence: pass after pass over its rows, each
-    pass in another order. All of it is a function of (seed, epoch); earlier draws are counted from the first epoch on.
+    An epoch draws as many rows as it has room for, each of a random part, by weight: the next row of that part's endless
+    sequence, which is pass after pass over its rows, each pass in another order. All of it is a function of (seed, epoch);
+    earlier draws are counted from the first epoch on.
     """
 
     def __init__(self, batches: Batches, pack: MixedPack) -> None:
@@ -55,8 +55,7 @@ class PartOrder:
         grouped = batches.touch_groups is not None
         self.touch_groups = [pack.touch_groups[own] if grouped else None for own in self.rows]
         self.shares = pack.shares(rows)
-        self.length = self.shape[1] if pack.one_part else 1  # rows of one draw
-        self.num = self.shape[0] * self.shape[1] // self.length  # draws of an epoch
+        self.num = self.shape[0] * self.shape[1]  # draws of an epoch
         self.before = [np.zeros(len(self.rows), np.int64)]  # draws of each part before each epoch
 
     def epoch(self, number: int) -> np.ndarray:
@@ -67,10 +66,9 @@ class PartOrder:
         first, last = self.before[number : number + 2]
         parts = np.repeat(np.arange(len(self.rows)), last - first)
         parts = np.random.default_rng(mix(self.seed, 3, number)).permutation(parts)
-        drawn = np.empty((self.num, self.length), np.int64)
+        drawn = np.empty(self.num, np.int64)
         for part in np.unique(parts).tolist():
-            wanted = self._sequence(part, int(first[part]) * self.length, int(last[part]) * self.length)
-            drawn[parts == part] = wanted.reshape(-1, self.length)
+            drawn[parts == part] = self._sequence(part, int(first[part]), int(last[part]))
         return self._apart(drawn.reshape(self.shape))
 
     def _apart(self, drawn: np.ndarray) -> np.ndarray:
@@ -98,19 +96,17 @@ def check_mix(run: Run, pack: Pack, rows: np.ndarray, world: World) -> None:
     if not isinstance(pack, MixedPack):
         return
     sizes = np.bincount(pack.part_of[rows], minlength=len(pack.parts))
-    shares = np.ones(len(sizes)) if pack.one_part else pack.shares(rows)
-    for name, size, share in zip(pack.parts, sizes.tolist(), shares.tolist(), strict=True):
+    for name, size, share in zip(pack.parts, sizes.tolist(), pack.shares(rows).tolist(), strict=True):
         if not size:
             raise ValueError(f"method {run.method.name!r} learns from no row of part {name}: leave it out")
         if size < share * run.batch_size - 1e-6:
             asked = f"{share * run.batch_size:.0f} of a batch of {run.batch_size}"
             raise ValueError(f"part {name} has {size} rows to train on, for {asked}: a row would be its own negative")
     senses = np.stack([pack.has(modality)[rows] for modality in pack.spec.modalities])
-    if pack.one_part or (senses == senses[:, :1]).all():
+    if (senses == senses[:, :1]).all():
         return
     if world.size > 1 or run.chunk:
-        how = "support neither several processes nor --chunk: give --data.batches one-part"
-        raise ValueError(f"parts that lack a modality, in mixed batches, {how}")
+        raise ValueError("parts that lack a modality support neither several processes nor --chunk: leave them out")
     if run.batch_size < 3:
         raise ValueError(f"batch_size {run.batch_size}: parts that lack a modality need at least 3")
 

@@ -112,7 +112,11 @@ def time_shift(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     notes, suspects = [], []
     for task in pack.spec.values:
         for t, target in enumerate(task.targets):
-            found = [_shift(change, pack.values(task)[:, t], block) for rows in touches for block in _blocks(rows)]
+            found = [
+                _shift(change, pack.values(task)[:, t], block)
+                for rows in touches
+                for block in np.array_split(rows, -(-len(rows) // BLOCK))
+            ]
             sign = np.sign(sum(curve[abs(curve).argmax()] for _, curve in found)) or 1.0
             known = [(rows, sign * curve) for rows, curve in found if (sign * curve).max() >= CLEAR]
             late = [(rows, _lag(c)) for rows, c in known if c.max() - c[len(c) // 2] > GAIN]
@@ -132,10 +136,6 @@ def time_shift(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         return Finding(item, "not checkable", f"no value follows |frame - first frame| of {modality}")
     advice = "join by better time stamps, or shift the log: --log FILE:COLUMN-SECONDS if it is late, +SECONDS if early"
     return judged(item, "; ".join(notes), advice, suspects, look=bool(suspects))
-
-
-def _blocks(rows: np.ndarray) -> list[np.ndarray]:
-    return np.array_split(rows, -(-len(rows) // BLOCK))
 
 
 def _lag(curve: np.ndarray) -> int:

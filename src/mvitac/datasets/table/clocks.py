@@ -97,16 +97,18 @@ def join(
         made: list[Row] = [{} for _ in table.rows]
         gap, same = 0.0, 0
         for file, at in _files(table, name, refs).items():
-            _check_apart(file, times[at], [recordings[i] for i in at])
             log = with_elements(read_manifest(file), numbers)
+            if (whole := text.removeprefix(f"{name}:")) != column and whole in log.columns:
+                raise ValueError(f"{file} has a column {whole!r}, which reads as {column!r} and a shift: rename it")
             log.check(column)
+            _check_apart(file, times[at], [recordings[i] for i in at])
             stamps = seconds(log.filled(column, "time"), f"{file}, column {column}") + shift
             same += len(stamps) - len(np.unique(stamps))
             cells, largest = joined(log, stamps, times[at], (numbers if linear else ()), tolerance)
             gap = max(gap, largest)
             if not any(cells):
                 own, theirs = (f"{np.nanmin(t):.3f} to {np.nanmax(t):.3f} s" for t in (stamps, times[at]))
-                how = f"{text}+SECONDS shifts it, or write the times of each video into NAME_timestamps.csv"
+                how = f"{name}:{column}+SECONDS shifts it, or write the times of each video into NAME_timestamps.csv"
                 raise ValueError(f"{file} has no time of the images, {theirs}, but {own}: {how}")
             for i, row in zip(at, cells, strict=True):
                 made[i] = {c: cell for c, cell in row.items() if c != column}

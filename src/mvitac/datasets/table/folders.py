@@ -29,12 +29,8 @@ VAL = 10
 def list_images(root: Path, plain: str, every: int | None) -> Manifest:
     """Return the table of the images below ``root``: of class folders, or of one recording.
 
-    A file without a counterpart leaves a cell empty.
-
-    Args:
-        root: The folder.
-        plain: Modality of the images if no folders name it.
-        every: Of a recording, every how many images are used.
+    A file without a counterpart leaves a cell empty. ``plain``: modality of the images if no folders name it. ``every``: of
+    a recording, every how many images are used.
     """
     splits = [split for split in SPLITS if (root / split).is_dir()]
     for other in sorted(root.iterdir()) if splits else ():
@@ -96,12 +92,8 @@ def list_videos(path: Path, names: Sequence[str], plain: str, every: int | None,
 
     It has every n-th frame of a recording's first camera, and the frames of its other cameras at that time.
 
-    Args:
-        path: A video, or a folder.
-        names: Names of cameras besides ``CAMERAS``, the most important first.
-        plain: Modality of a video without such a name, if no ``names`` are given.
-        every: Every how many frames are used.
-        tolerance: Largest distance in seconds between frames of two cameras; rows with a larger one are left out.
+    ``names`` are those of cameras besides ``CAMERAS``, the most important first; ``plain`` is the modality of a video
+    without such a name, if none are given. Rows whose cameras are more than ``tolerance`` seconds apart are left out.
     """
     plain, names = "" if names else plain, tuple(dict.fromkeys((*names, *CAMERAS)))
     recordings: dict[str, dict[str, Path]] = {}
@@ -123,9 +115,11 @@ def list_videos(path: Path, names: Sequence[str], plain: str, every: int | None,
     away, alone = 0.0, 0
     for recording, files in sorted(recordings.items()):
         times = {camera: times_of(file) for camera, file in files.items()}
-        own = times[next(camera for camera in cameras if camera in files)]
+        first = next(camera for camera in cameras if camera in files)
+        own = times[first]
         shown = np.arange(0, len(own), every or EVERY)
         at = {camera: nearest(each, own[shown]) for camera, each in times.items()}
+        at[first] = shown, np.zeros(len(shown))  # several may have one stamp
         apart = np.max([miss for _, miss in at.values()], axis=0)
         alone += int((apart > tolerance).sum())
         for i in np.flatnonzero(apart <= tolerance):

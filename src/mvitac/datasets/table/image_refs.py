@@ -214,7 +214,7 @@ def entry(data: Any, index: int) -> Any:
 
 def span_of(ref: ImageRef) -> tuple[float, ...]:
     """Return the numbers that become black and white of an image of more than 8 bits; () of others, and of damaged ones."""
-    with suppress(ValueError, OSError), ref.opened() as container:
+    with suppress(ValueError, OSError, Image.DecompressionBombError), ref.opened() as container:
         found = ref.stored(container)
         if isinstance(found, np.ndarray):
             return () if found.dtype == np.uint8 else ref.span or _usual(found.dtype)

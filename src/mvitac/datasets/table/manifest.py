@@ -198,13 +198,23 @@ def _read_csv(file: Path) -> list[dict[str, Any]]:
         stream.seek(0)
         sign = next((sign for sign in ",;\t" if sign in header), ",")
         names, *lines = [line for line in csv.reader(stream, delimiter=sign) if line] or [[]]
-    names = [name.strip() for name in names]
-    if len(set(names)) < len(names):
-        raise ValueError(f"it has two columns of one name: {', '.join(names)}")
+    names = _differing([name.strip() for name in names])
     for number, line in enumerate(lines, 1):
         if len(line) != len(names):
             raise ValueError(f"row {number} has {len(line)} cells for {len(names)} columns: quote cells with commas")
     return [dict(zip(names, line, strict=True)) for line in lines]
+
+
+def _read_parquet(file: Path) -> list[dict[str, Any]]:
+    table = pq.ParquetFile(file).read()
+    _differing(table.column_names)
+    return table.to_pylist()
+
+
+def _differing(names: list[str]) -> list[str]:
+    if len(set(names)) < len(names):
+        raise ValueError(f"it has two columns of one name: {', '.join(names)}")
+    return names
 
 
 def _read_jsonl(file: Path) -> list[dict[str, Any]]:
@@ -216,6 +226,6 @@ def _read_jsonl(file: Path) -> list[dict[str, Any]]:
 
 READERS: dict[str, Callable[[Path], list[dict[str, Any]]]] = {
     ".csv": _read_csv,
-    ".parquet": lambda file: pq.ParquetFile(file).read().to_pylist(),
+    ".parquet": _read_parquet,
     ".jsonl": _read_jsonl,
 }

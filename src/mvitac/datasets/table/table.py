@@ -32,7 +32,7 @@ VERSION = 3  # version of this reader. Increase it when the same table would giv
 MAX_TOGETHER = 1024  # rows of one video that are read in one pass, if their images fit into ``MAX_TOGETHER_BYTES``
 MAX_TOGETHER_BYTES = 600 << 20
 """Memory per worker for these images at the stored size: 1024 rows of two gels and a camera at 256 px."""
-CONTROL_NAMES = ("majority", "pixels", "border", "untrained", "imagenet", "start")
+CONTROL_NAMES = ("majority", "mean", "pixels", "border", "untrained", "imagenet", "start")
 """Controls that every probe computes by itself."""
 
 
@@ -146,7 +146,9 @@ class RowsConfig(DatasetConfig, ABC):
             for text in texts:
                 column, _, listed = text.partition("=")
                 numbers = [number for part in listed.split(":") if (number := number_of(part)) is not None]
-                good = len(numbers) == many == listed.count(":") + 1
+                good = len(numbers) == many == listed.count(":") + 1 and (
+                    many == 2 or all(n == int(n) for n in numbers)
+                )
                 if not good or (numbers[0] >= numbers[1] if many == 2 else min(numbers) < 0 or not all(numbers[2:])):
                     raise ValueError(f"{text!r}: write COLUMN={'x:y:width:height' if many == 4 else 'LOW:HIGH'}")
                 looks.setdefault(column, {})[name] = tuple(map(int, numbers) if many == 4 else numbers)
@@ -203,8 +205,10 @@ class Rows(Source):
         value_tasks = [value_task(text) for text in config.values]
         targets = [target.name for task in value_tasks for target in task.targets]
         used = (*label_columns, *targets, self._group, *({self._split} - {BY_GROUP}), self._sensor, config.touch_group)
+        used += (*config.conditioned(), *(c for used in config.control_columns().values() for c in used))
         table.check(*used)
-        table.check(*config.conditioned(), *(c for used in config.control_columns().values() for c in used))
+        for column in {*used} & {*table.images} - {*table.rows[0]}:
+            raise ValueError(f"{table.path}: column {column!r} holds images, not text or numbers: name another")
 
         table, grounds = self._select(table)
         asked = {"vision": self._images[: bool(self._vision)], "touch": self._touch}
