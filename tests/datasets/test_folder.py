@@ -20,6 +20,7 @@ from mvitac.data.build import build
 from mvitac.data.checks.examine import examine_source
 from mvitac.data.images import decode, fit, shrink
 from mvitac.data.pack import Pack
+from mvitac.data.spec import UNGROUPED
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.table.splits import assign_splits
 from mvitac.datasets.table.table import Rows
@@ -286,7 +287,8 @@ def test_class_folders_pair_by_name(tmp_path: Path, kind: str) -> None:
     assert (pack.column("label_label") == seen % 2).all()
     if kind != "plain":
         assert (pack.images["touch"][:, 0, 0, 0] == (seen + 100) * pack.has("touch")).all()
-        assert pack.column("group")[~pack.has("touch")].tolist() == ["/moss/5"] * (kind == "a gap")
+        assert seen[~pack.has("touch")].tolist() == [5] * (kind == "a gap")
+    assert pack.spec.group_by == "row" and any(UNGROUPED in note for note in pack.spec.notes)
 
 
 def test_class_folders_may_be_grouped_and_split(tmp_path: Path) -> None:

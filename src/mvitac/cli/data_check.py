@@ -21,7 +21,7 @@ from mvitac.datasets.table.table import RowsConfig
 from mvitac.report.contact_sheet import draw, samples, suspicious
 from mvitac.system.files import check_place, write_atomic
 
-_MANUAL = """Examine a dataset: unreadable, constant, BGR, mislabelled, copied, leaking, out of step, outside train.
+_MANUAL = """Examine a dataset: unreadable, constant, BGR, copied, leaking, out of step, outside train.
 
     Exit code: 0 all is well, 1 a person should look, 2 something is broken (or the command could not be run).
     Heuristics only report "look", with their figures; "broken" is a fact. Nothing is changed.

@@ -74,10 +74,11 @@ def export(argv: list[str]) -> None:
     how = "check the export on a pack, --on PACK"
     pack = Pack(options.on) if options.on else own_data(model, how, few=bool(model.probes))
     pack = as_trained(model, pack)
+    print("writing and checking the export takes up to a minute", flush=True)
     with shown():
         new = Pack(options.new_sensor) if options.new_sensor else None
         report = export(with_probes(model, pack), pack, options.out, options, new=new)
-    title = f"{options.out}: checked on {report['num_rows']} {f'rows of {new.path}' if new else 'test rows'}"
+    title = f"{options.out}: checked on {report['num_rows']} rows of {(new or pack).path}"
     print(text_table(title, ["", "original", "export"], _rows(report)))
 
 

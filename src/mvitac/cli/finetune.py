@@ -9,7 +9,9 @@ from tyro.conf import Positional
 
 from mvitac.cli.options import asks_help, parse, selectors
 from mvitac.datasets.base import DatasetConfig, dataset
-from mvitac.experiments.finetune import Finetuning
+from mvitac.evaluation.diagnostics import mean_error
+from mvitac.evaluation.scores import each_score
+from mvitac.experiments.finetune import FROZEN, TUNED, Finetuning
 from mvitac.experiments.finetune import finetune as run_finetune
 from mvitac.report.tables import print_finetuning
 
@@ -47,4 +49,10 @@ def finetune(argv: list[str]) -> None:
     given = options.model, options.data, options.config, options.out
     result = run_finetune(*given, resume=options.resume, quiet=options.quiet)
     print_finetuning(result)
-    print(f"scores: {options.out / 'scores.json'}\nnext: mvitac publish {result['models'][-1]} ARTIFACT")
+    print(f"scores: {options.out / 'scores.json'}")
+    last = [record for record in result["records"] if record["fraction"] == options.config.fractions[-1]]
+    tuned, frozen = (mean_error([each_score(r) for r in last if r["source"] == name]) for name in (TUNED, FROZEN))
+    if tuned < frozen:
+        print(f"next: mvitac publish {result['models'][-1]} ARTIFACT (with probes of its own, on all labels)")
+    else:
+        print("fine-tuning gained nothing over the frozen probe: keep the model as it is, and publish or probe that")

@@ -81,7 +81,8 @@ def live(argv: list[str]) -> None:
     options = parse(_Options, argv, "live")
     check_json(options.json)
     free = options.free()
-    engine = _engine(options.model, options.threads)
+    given = {"vision": options.vision, "touch": options.touch}
+    engine = _engine(options.model, options.threads, tuple(m for m, texts in given.items() if texts))
     streams: Any = _streams(options, engine)
     if not (options.vision or options.touch):
         _say("no --vision, no --touch: all sensors are simulated")

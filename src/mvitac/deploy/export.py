@@ -61,8 +61,8 @@ def export(
     rows = pack.rows("test", having=asked)
     if new and not len(rows):
         rows = np.flatnonzero(np.logical_and.reduce([new.has(modality) for modality in asked]))
-    if not len(rows):
-        raise ValueError(f"{pack.path} has no rows in split test to check the export on")
+    if not len(rows) and not len(rows := pack.rows("val", "train", having=asked)):  # recordings have no test
+        raise ValueError(f"{pack.path} has no rows with {' and '.join(asked)} to check the export on")
     rows = sample(rows, config.num_rows)
     with new_folder(out) as partial:
         with work("writing ONNX"), silent():

@@ -133,12 +133,9 @@ def _pass(blocks: nn.Sequential, tokens: Tensor, live: Tensor | None) -> Tensor:
 class Predictor(nn.Module):
     """A narrow ViT that predicts something about hidden patches from visible ones (MAE's decoder, I-JEPA's predictor).
 
-    A hidden patch is a learned mask token plus the fixed sine-cosine embedding of its position.
-
-    Args:
-        trunk: Whose tokens it reads.
-        out: Width of the predictions.
-        share, most: Width and number of blocks are this share of the trunk's, in whole heads of 32 features, up to ``most``.
+    A hidden patch is a learned mask token plus the fixed sine-cosine embedding of its position. ``out``: width of the
+    predictions. Its own width and number of blocks are ``share`` of the trunk's, in whole heads of 32 features, up to
+    ``most``.
     """
 
     def __init__(self, trunk: nn.Module, out: int, share: float, most: tuple[int, int]) -> None:

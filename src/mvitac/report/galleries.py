@@ -40,7 +40,7 @@ def mistakes(study: Study) -> list[Markup]:
         for at in sample(np.flatnonzero(asked & wrong), NUM_QUERIES).tolist():
             kinds = ("" if labels[i] < 0 else "same class" if labels[i] == labels[at] else "other" for i in near[at])
             found = list(zip(rows[near[at]].tolist(), kinds, strict=True))
-            strips.append(_strip(study, modality, int(rows[at]), str(groups[at]), found))
+            strips.append(_strip(study, modality, int(rows[at]), found))
         title = f"{modality}: {(asked & wrong).sum()} of {len(shown)} rows" if known else modality
         halves.append(html.card(title, strips))
     by, name = pack.spec.group_by, study.runs[0].path.name
@@ -55,10 +55,10 @@ def mistakes(study: Study) -> list[Markup]:
 _SHOWN = {"": ("", ""), "other": ("wrong", "\u2715 another class"), "same class": ("same", "\u2248 same class")}
 
 
-def _strip(study: Study, modality: str, row: int, text: str, found: Sequence[tuple[int, str]]) -> Markup:
-    """The picture of ``row``, with ``text``, and the rows ``found``."""
+def _strip(study: Study, modality: str, row: int, found: Sequence[tuple[int, str]]) -> Markup:
+    """The picture of ``row`` and those of the rows ``found``, with their class and id."""
     image, name = _picture(study, modality, row)
-    cells = [html.cell("asked", image, "", f"{name}; {text}")]
+    cells = [html.cell("asked", image, "", name)]
     for other, kind in found:
         css, mark = _SHOWN[kind]
         image, name = _picture(study, modality, other)
@@ -71,4 +71,4 @@ def _picture(study: Study, modality: str, row: int) -> tuple[Markup, str]:
     group = str(pack.column("group")[row])
     name = pack.spec.tasks[0].classes[label] if label >= 0 else group
     alt = f"{modality} of {pack.spec.group_by} {group} ({name})"
-    return picture(pack.images[modality][row], alt), figures.shorten(name, 24)
+    return picture(pack.images[modality][row], alt), f"{figures.shorten(name, 24)}; {pack.column('id')[row]}"

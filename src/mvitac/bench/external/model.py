@@ -29,12 +29,7 @@ PICTURES = DataSpec(
 class ExternalEncoder(nn.Module):
     """Features [B, S D] of raw images [B, C, H, W], uint8 or float in [0, 1]. Several sensors are encoded one by one.
 
-    Args:
-        adapter: Its options.
-        loaded: What it opened.
-
-    Raises:
-        ValueError: If the network does not take such images.
+    ``loaded`` is what ``adapter`` opened. ValueError if the network does not take such images.
     """
 
     def __init__(self, adapter: Adapter, loaded: Loaded) -> None:
@@ -98,13 +93,8 @@ class ExternalModel(Model):
     """A frozen encoder with the interface of ``Model`` that probes, features and ``embed`` use.
 
     There is no run, no shared space and no own head. Images of several sensors are encoded one by one and their features
-    joined. Where it needs more frames than a row has, the oldest one is repeated.
-
-    Attributes:
-        text: What named the encoder.
-        name: Its name.
-        parts: modality -> the opened encoder, bound to its images.
-        notes: What the data lacks that the encoder wants.
+    joined. Where it needs more frames than a row has, the oldest one is repeated. ``text`` named the encoder; ``parts``:
+    modality -> the opened one, bound to its images; ``notes``: what the data lacks that it wants.
     """
 
     def __init__(

@@ -57,7 +57,8 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         pairs, base = _near_pairs(residuals, asked, bank, groups, one.exact)
         rate = len(pairs) / len(asked)
         notes.append(
-            f"{name}: {share(len(pairs), len(asked))} of held-out rows nearly repeat one of train"
+            f"{name}: {share(len(pairs), len(asked))} of the held-out rows that are clear enough to compare nearly repeat"
+            f" one of train"
             f" ({100 * base:.1f} % between groups of train)"
         )
         suspicious |= rate > 0.01 or (len(pairs) >= 3 and rate > 3 * base)

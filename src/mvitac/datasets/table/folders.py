@@ -40,7 +40,9 @@ def list_images(root: Path, plain: str, every: int | None) -> Manifest:
     if not rows:
         raise ValueError(f"{root} holds no manifest, HDF5 file, videos or images ({', '.join(IMAGES)})")
     if all("label" in row for row in rows):
-        return Manifest.of(root, rows, labels=("label",))
+        if len({row["group"] for row in rows}) == len(rows):  # no groups, which results say
+            rows = [{name: cell for name, cell in row.items() if name != "group"} for row in rows]
+        return Manifest.of(root, rows, labels=("label",), notes=("each folder of images is a class",))
     return Manifest.of(root, rows, group="recording")
 
 
