@@ -126,8 +126,7 @@ def test_a_split_that_leaks_marks_every_score(run: Path, pack: Pack) -> None:
     own = copy(pack)
     sides = pa.array(np.where(np.arange(pack.num) % 2 == 0, "test", "train"))
     own.table = pack.table.set_column(pack.table.column_names.index("split"), "split", sides)
-    session = ProbeConfig(tasks=("pattern",), modalities=("touch",))
-    result = probe_runs([run], session, own, allow_leak=True)
+    result = probe_runs([run], ProbeConfig(tasks=("pattern",), modalities=("touch",)), own, allow_leak=True)
     assert {leak_mark(record["leak"]) for record in (*result["records"], *result["retrieval"])} == {" LEAK"}
     assert result["leaks"][0] == "60 of 60 test instances are also in train: this split leaks"
 

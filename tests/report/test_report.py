@@ -285,6 +285,8 @@ def test_one_test_group_proves_nothing(tmp_path: Path) -> None:
     assert "11 test things with both." in page.text
     assert "1 test thing, so no interval" in page.text and "% [0.0, 100.0]" in page.text
     card = (publish(run, tmp_path / "card") / "README.md").read_text()
+    few, _ = noise(tmp_path / "few", Noise(tested=(2, 5)))
+    assert main(["publish", str(few), str(tmp_path / "few/card")]) == 0  # it prints no hint of probe's
     assert "(1 test thing, so no interval)" in card and re.search(r"\| untrained \| \S+ \[0\.0, 100\.0\] \|", card)
 
 

@@ -60,9 +60,8 @@ def test_links_stay_and_devices_are_refused(tmp_path: Path) -> None:
     write_json(tmp_path / "link", [1])
     assert (tmp_path / "link").is_symlink() and json.loads((tmp_path / "target").read_text()) == [1]
     os.mkfifo(tmp_path / "pipe")
-    for write in (check_place, lambda path: write_json(path, [1])):
-        with pytest.raises(ValueError, match="pipe is neither a file nor a folder"):
-            write(tmp_path / "pipe")
+    with pytest.raises(ValueError, match="pipe is neither a file nor a folder"):
+        check_place(tmp_path / "pipe")
 
 
 def test_nothing_is_shown_unasked(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

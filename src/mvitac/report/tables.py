@@ -70,7 +70,7 @@ def print_summary(result: dict[str, Any], file: TextIO | None = None, *, probe: 
         if clipped := clipped_text(task):
             print(clipped, file=file)
     _print_notes(result, trained, file)
-    if 1 < few < 10 and not result["asked"]["folds"]:
+    if 1 < few < 10 and result.get("asked", {}).get("folds") == 0:  # of probe
         hint = f"hint: {few} test {by}s tell little: --folds {min(5, few)} tests every {by} no run learned from"
         print(textwrap.fill(hint, 80, subsequent_indent="  "), file=file)
 
