@@ -47,6 +47,7 @@ from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import FILE, read_sources
 from mvitac.model import load, safetensors_digest
 from mvitac.run import load_run
+from mvitac.system import files as system_files
 from mvitac.system.files import read_json
 from mvitac.training import checkpoint
 from mvitac.training.step import Step
@@ -299,6 +300,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--points", type=int, default=0, help="kills per command; 0 = before every change of the disk")
     parser.add_argument("--num", type=int, default=100, help="flips per kind of file")
     options = parser.parse_args(argv)
+    system_files._STALE = -1  # what a kill leaves is removed at once, not after ten minutes
     if "kills" in options.kinds:
         modules = {ALL[" ".join(command.split()[:2])].split(":")[0] for command in options.commands}
         for name in (*(f"mvitac.cli.{module}" for module in modules), *SLOW):
