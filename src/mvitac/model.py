@@ -24,22 +24,13 @@ from mvitac.nn.weights import misfit, read_model, safetensors_digest, write_mode
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run
 from mvitac.system.files import brief, digest, parse_json
-from mvitac.system.sealed_folder import SealedFolder
+from mvitac.system.sealed_folder import ARTIFACT
 from mvitac.transforms.preprocess import ImageInput, Preprocess, check_images, encoder_input, resized, to_array
 
 ABOUT = ("run", "spec", "stored")  # texts in the header of a file of weights
 MAX_STORED = 1024  # px: no pack holds larger images (``data.storage``)
 BEST = "model.best.safetensors"  # weights of a run that were best on split val, kept with ``Run.eval_every``
 Which = Literal["last", "best"]
-ARTIFACT = SealedFolder(
-    "artifact.json",
-    "mvitac-artifact",
-    2,
-    "mvitac publish",
-    required=frozenset(("model.safetensors", "run.json")),
-    optional=frozenset(("probes.safetensors", "trained_on.safetensors", "README.md")),
-)
-"""What ``mvitac publish`` writes (``deploy.artifact``)."""
 EMBED_BATCH = 64  # images that ``Model.embed`` passes through an encoder at once: 0.5 GB with ResNet-18 at 224 px
 
 

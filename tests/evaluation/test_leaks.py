@@ -128,7 +128,7 @@ def test_a_split_that_leaks_marks_every_score(run: Path, pack: Pack) -> None:
     own.table = pack.table.set_column(pack.table.column_names.index("split"), "split", sides)
     result = probe_runs([run], ProbeConfig(tasks=("pattern",), modalities=("touch",)), own, allow_leak=True)
     assert {leak_mark(record["leak"]) for record in (*result["records"], *result["retrieval"])} == {" LEAK"}
-    assert result["leaks"][0] == "60 of 60 test instances are also in train: this split leaks"
+    assert "60 of 60 test instances are also in train: this split leaks" in result["leaks"]
 
 
 def test_an_artifact_with_another_list_is_refused(run: Path, turned: Pack, tmp_path: Path) -> None:

@@ -421,8 +421,8 @@ def test_a_leak_of_a_tasks_own_split_is_flagged(pack: Pack) -> None:
     own.table = pack.table.append_column("split_bright", pa.array(sides))
     task = replace(bright, split="split_bright")
     said = own.split_leaks([pattern, task])
-    assert said == ["30 of 30 test instances of bright are also in train: this split leaks"]
-    assert own.split_leaks([pattern]) == []  # nothing that is scored
+    assert said == {"split_bright": "30 of 30 test instances of bright are also in train: this split leaks"}
+    assert own.split_leaks([pattern]) == {}  # nothing that is scored
 
 
 def test_what_must_be_said_beside_every_result_is(done: tuple[Path, dict], pack: Pack) -> None:

@@ -64,10 +64,8 @@ def _groups(pack: Pack) -> str:
     sizes = Counter(pack.column("group").tolist()).values()
     rows = " to ".join(map(str, dict.fromkeys((min(sizes), max(sizes)))))
     about = f"groups: {len(sizes)}, one per {pack.spec.group_by}, of {rows} row{'s' * (rows != '1')} each"
-    leaks = pack.split_leaks(pack.spec.all_tasks)
-    return f"{about}. " + (
-        f"LEAK: {'; '.join(leaks)}." if leaks else "A split takes whole groups, and intervals resample them."
-    )
+    leaks = "; ".join(pack.split_leaks(pack.spec.all_tasks).values())
+    return f"{about}. " + (f"LEAK: {leaks}." if leaks else "A split takes whole groups, and intervals resample them.")
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,6 @@ def finetune(argv: list[str]) -> None:
     last = [record for record in result["records"] if record["fraction"] == options.config.fractions[-1]]
     tuned, frozen = (mean_error([each_score(r) for r in last if r["source"] == name]) for name in (TUNED, FROZEN))
     if tuned < frozen:
-        print(f"next: mvitac publish {result['models'][-1]} ARTIFACT (with probes of its own, on all labels)")
+        print(f"next: mvitac publish {result['models'][-1]} ARTIFACT\n  (it fits probes of its own, on all labels)")
     else:
         print("fine-tuning gained nothing over the frozen probe: keep the model as it is, and publish or probe that")

@@ -178,16 +178,15 @@ class Pack:
             mask &= self.column(name).astype(str) == value
         return np.flatnonzero(mask)
 
-    def split_leaks(self, tasks: Sequence[AnyTask]) -> list[str]:
-        """Say of each split that ``tasks`` use how many of its test groups are in its train, too."""
-        groups, said = self.column("group").astype(str), []
-        for column in dict.fromkeys(("split", *(task.split for task in tasks))):
+    def split_leaks(self, tasks: Sequence[AnyTask]) -> dict[str, str]:
+        """Column of each split that ``tasks`` use (or "split") -> how many of its test groups are in its train, if any."""
+        groups, said = self.column("group").astype(str), {}
+        for column in dict.fromkeys(task.split for task in tasks) or ("split",):
             own = "" if column == "split" else f" of {' and '.join(t.name for t in tasks if t.split == column)}"
             train, test = ({*groups[self.rows(split, by=column)]} for split in ("train", "test"))
             if both := len(train & test):
-                said.append(
-                    f"{both} of {len(test)} test {self.spec.group_by}s{own} are also in train: this split leaks"
-                )
+                how = f"{both} of {len(test)} test {self.spec.group_by}s{own}"
+                said[column] = f"{how} are also in train: this split leaks"
         return said
 
     def with_splits(self, splits: "Mapping[str, Iterable[str]]") -> "Pack":

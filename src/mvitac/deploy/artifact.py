@@ -16,13 +16,14 @@ from typing import Any
 
 from mvitac import model as models
 from mvitac.evaluation.encoders import is_encoder, open_encoder
-from mvitac.model import ARTIFACT, Model
+from mvitac.model import Model
 from mvitac.nn.encoders import num_features
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.nn.weights import read_safetensors
 from mvitac.registry import from_json, to_json
 from mvitac.shipped import named
 from mvitac.system.files import brief, fields_of
+from mvitac.system.sealed_folder import ARTIFACT
 
 AS_GIVEN = "none is subtracted: tactile images are used as the sensor gives them"
 SUBTRACTED = (

@@ -15,13 +15,13 @@ from mvitac.deploy.artifact import preprocessing, read
 from mvitac.deploy.card import card
 from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import as_trained, check_unseen, stored_result
-from mvitac.evaluation.leaks import Scored, Source, write_sources
+from mvitac.evaluation.leaks import Scored, Source, mark_split_leaks, write_sources
 from mvitac.evaluation.probe import FittedProbes, probe_model, scorable, split_rows
 from mvitac.evaluation.regressors import Linear
 from mvitac.evaluation.scores import summarise
 from mvitac.evaluation.sensors import sensors_of
 from mvitac.evaluation.value_scores import error_by_range
-from mvitac.model import ARTIFACT, Model, load
+from mvitac.model import Model, load
 from mvitac.nn.encoders import build_trunk
 from mvitac.nn.linear_probe import Error, LinearProbe, ProbeInfo, ValueInfo
 from mvitac.registry import to_json
@@ -29,6 +29,7 @@ from mvitac.run import load_run
 from mvitac.system.files import brief, write_atomic, write_json
 from mvitac.system.locks import new_folder
 from mvitac.system.progress import work
+from mvitac.system.sealed_folder import ARTIFACT
 
 NUM_SIMULATED = 1000  # 400 test rows of ``materials`` with two sensors per press
 NUM_RANGES, RANGE_ROWS = 8, 20
@@ -94,6 +95,7 @@ def _scores(run: Path, model: Model, pack: Pack, records: Records) -> dict[str, 
         "data": pack.spec.name,
         "group_by": pack.spec.group_by,
         "notes": list(pack.spec.notes),
+        "leaks": mark_split_leaks(pack, [*records, *controls]),
         "summary": summarise([*({**own, **record} for record in records), *controls]),
     }
 
@@ -145,6 +147,7 @@ def _fit_and_score(run: Path, model: Model, pack: Pack, allow_leak: bool) -> tup
     for probe, record in fitted:
         q = probe.info
         record["leak"] = scored.leak(learned, split_rows(pack, tasks[q.task], q.modality).test)
+        mark_split_leaks(pack, [record])
         probe.info = replace(q, leak=record["leak"])
     model.probes = {probe.info.name: probe for probe, _ in fitted}
     return learned, _scores(run, model, pack, [record for _, record in fitted])

@@ -60,8 +60,7 @@ class Embeddings:
             about = json.loads(self.table.schema.metadata[ABOUT])
             self.shared, self.pack, self.pack_digest = about["shared"], Path(about["pack"]), about["pack_digest"]
             self.classes = from_json(dict[str, tuple[str, ...]], about["classes"], "classes")
-            for name in ("id", "group", "row"):
-                self.table.column(name)
+            self.table.select(["id", "group", "row"])  # KeyError if one is missing
             columns = {m: self.table.column(m) for m in ("vision", "touch") if m in self.table.column_names}
             given = {m: column.combine_chunks().flatten().to_numpy() for m, column in columns.items()}
             self.banks = {m: unit(x.reshape(self.table.num_rows, -1)) for m, x in given.items()}

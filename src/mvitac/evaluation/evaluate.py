@@ -15,7 +15,7 @@ from mvitac.evaluation.controls import CONTROLS, Records, controls_of, frozen_tr
 from mvitac.evaluation.encoders import Bound, open_encoders, probe_encoders
 from mvitac.evaluation.features import fitting
 from mvitac.evaluation.folds import fold_splits
-from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
+from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, mark_split_leaks, read_sources
 from mvitac.evaluation.probe import probe_model, probes_of, seen_by, split_rows
 from mvitac.evaluation.probe_config import ProbeConfig
 from mvitac.evaluation.retrieval import cross_modal, retrieved_rows
@@ -99,17 +99,15 @@ def probe_runs(
         tested = [f"{session.folds} folds: every {pack.spec.group_by} that no run learned from is tested once"]
     else:
         (records, retrieval), tested = score(pack, others, tasks), []
-    said, split = leaks_of([*records, *retrieval]), [] if session.folds else pack.split_leaks(tasks)
-    for record in (*records, *retrieval) if split else ():
-        if record.get("leak", "") in ("", UNKNOWN):
-            record["leak"] = "; ".join(split)
+    every = [*records, *retrieval]
+    leaks = [*leaks_of(every), *([] if session.folds else mark_split_leaks(pack, every))]
     classes = {task.name: list(task.classes) for task in tasks if isinstance(task, Task)}
     result = {
         **{"data": pack.spec.name, "pack": pack.digest, "group_by": pack.spec.group_by},
         **{"notes": [*pack.spec.notes, *tested], "classes": classes},
         "targets": {task.name: to_json(task.targets) for task in tasks if isinstance(task, ValueTask)},
         **{"asked": to_json(session), "models": _digests(paths, weights)},
-        **{"encoders": [m.describe() for m, _ in others], "leaks": [*split, *said]},
+        **{"encoders": [m.describe() for m, _ in others], "leaks": leaks},
         **{"records": records, "retrieval": retrieval, "summary": summarise(records, session.probes[0])},
         "per_class": per_class(records, classes, session.probes[0]),
     }

@@ -168,3 +168,14 @@ def leaks_of(records: Sequence[dict[str, Any]]) -> list[str]:
         elif record.get("leak"):
             lines.append(f"{record['source']}, {record.get('task') or 'retrieval'}: {record['leak']}")
     return [*dict.fromkeys(lines), *([NOT_SEEN] if lines else [])]
+
+
+def mark_split_leaks(pack: Pack, records: Sequence[dict[str, Any]]) -> list[str]:
+    """A line for each split with groups in train and in test. Marks ``records`` of it, controls too: they gain alike."""
+    columns, found = {task.name: task.split for task in pack.spec.all_tasks}, pack.split_leaks(pack.spec.all_tasks)
+    said = {}
+    for record in records:
+        if text := found.get(columns.get(record.get("task", ""), "split")):
+            said[text] = None
+            record["leak"] = text if record.get("leak", "") in ("", UNKNOWN) else record["leak"]
+    return [*said]

@@ -40,10 +40,9 @@ class ProbeConfig:
             for value in values:
                 if values.count(value) > 1:
                     raise ValueError(f"{name} {value!r} is given twice: give it once")
-        for name, known in (("probe", Probe), ("standardise", Standardise)):
-            for value in given[name]:
-                if value not in get_args(known):
-                    raise unknown(name, value, get_args(known))
+        for probe in self.probes:
+            if probe not in get_args(Probe):
+                raise unknown("probe", probe, get_args(Probe))
         if not self.probes:
             raise ValueError("no probe given: choose from linear, paper, knn")
         if self.folds < 0 or self.folds == 1 or (self.folds and self.standardise):

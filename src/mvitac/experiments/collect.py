@@ -103,7 +103,7 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
         "pack": work.pack.digest,
         "group_by": work.pack.spec.group_by,
         "notes": [" ".join(note.split()) for note in work.pack.spec.notes],
-        "leaks": "; ".join(work.pack.split_leaks(chosen(work.pack, session)[0])),
+        "leaks": "; ".join(work.pack.split_leaks(chosen(work.pack, session)[0]).values()),
         "records": [record for records, _ in scored for record in records] + controls,
         "retrieval": [record for _, retrieval in scored for record in retrieval] + found,
         "rows": [row.label for row in work.plan.rows if row.label not in work.left_out],

@@ -25,7 +25,7 @@ from mvitac.evaluation.controls import IMAGENET_SIDE, imagenet_trunk
 from mvitac.evaluation.diagnostics import mean_error
 from mvitac.evaluation.evaluate import ProbeConfig, check_unseen, chosen
 from mvitac.evaluation.features import features, fitting
-from mvitac.evaluation.leaks import Scored, Source, file_source, leaks_of, read_sources, weights_files
+from mvitac.evaluation.leaks import Scored, Source, file_source, leaks_of, mark_split_leaks, read_sources, weights_files
 from mvitac.evaluation.probe import ProbeSplit, own_heads, probe_features, split_rows
 from mvitac.evaluation.scores import each_score
 from mvitac.methods.simclr import SimCLRConfig
@@ -74,8 +74,7 @@ class Finetuning:
     def __post_init__(self) -> None:
         if not (self.lr and self.steps and self.fractions and self.seeds > 0 and self.batch_size > 1):
             raise ValueError("give at least one of lr, steps, fractions and seeds, and a batch size of 2 or more")
-        if not all(0 < percent <= 100 for percent in self.fractions):
-            raise ValueError(f"fractions {self.fractions}: give percentages, above 0, at most 100")
+        ProbeConfig(fractions=self.fractions)  # checks them
 
 
 def finetune(
@@ -124,7 +123,11 @@ def finetune(
     records = [record for own, _ in found.values() for record in own]
     result = {
         **{"data": pack.spec.name, "pack": pack.digest, "ancestor": str(ancestor), "group_by": pack.spec.group_by},
-        **{"notes": list(pack.spec.notes), "leaks": leaks_of(records), "records": records},
+        **{
+            "notes": list(pack.spec.notes),
+            "leaks": [*leaks_of(records), *mark_split_leaks(pack, records)],
+            "records": records,
+        },
         "chosen": {f"{percent:g}": settings for percent, (_, settings) in found.items()},
         "models": [str(job.folder(asked.fractions[-1]) / f"seed{seed}") for seed in range(asked.seeds)],
     }

@@ -39,3 +39,14 @@ class SealedFolder:
             if not (folder / name).is_file() or digest_file(folder / name) != expected:
                 raise ValueError(f"{folder / name} is missing or does not match its digest: copy it again")
         return given
+
+
+ARTIFACT = SealedFolder(
+    "artifact.json",
+    "mvitac-artifact",
+    2,
+    "mvitac publish",
+    required=frozenset(("model.safetensors", "run.json")),
+    optional=frozenset(("probes.safetensors", "trained_on.safetensors", "README.md")),
+)
+"""What ``mvitac publish`` writes (``deploy.artifact``)."""

@@ -58,8 +58,7 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         rate = len(pairs) / len(asked)
         notes.append(
             f"{name}: {share(len(pairs), len(asked))} of the held-out rows that are clear enough to compare nearly repeat"
-            f" one of train"
-            f" ({100 * base:.1f} % between groups of train)"
+            f" one of train ({100 * base:.1f} % between groups of train)"
         )
         suspicious |= rate > 0.01 or (len(pairs) >= 3 and rate > 3 * base)
         rows += pairs.ravel().tolist()

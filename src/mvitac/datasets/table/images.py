@@ -29,7 +29,7 @@ def find(table: Manifest, vision: str | None, touch: tuple[str, ...]) -> tuple[s
         touch = tuple(c for c in touch if c)
     else:
         touch = ("touch",) if "touch" in have else ("left", "right") if {"left", "right"} <= set(have) else ()
-    table.check(vision, *touch)
+    table.check(vision, *touch, images=True)
     if vision in touch:
         raise ValueError(f"column {vision!r} would be both vision and touch: vision='' if there is no camera")
     if not (vision or touch):

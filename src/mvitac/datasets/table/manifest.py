@@ -75,9 +75,11 @@ class Manifest:
         """The names of all columns."""
         return tuple(dict.fromkeys((*self.rows[0], *self.images)))
 
-    def check(self, *columns: str | None) -> None:
-        """Raise ValueError unless each of ``columns`` that is not None exists."""
+    def check(self, *columns: str | None, images: bool = False) -> None:
+        """Raise ValueError unless each of ``columns`` that is not None exists, and holds text, not ``images``."""
         for column in columns:
+            if not images and column in self.images and column not in self.rows[0]:
+                raise ValueError(f"{self.path}: column {column!r} holds images, not text or numbers: name another")
             if column is not None and column not in self.columns:
                 for name in {column, column.partition("[")[0]} & self.left_out.keys():
                     raise ValueError(f"{self.path}: {name} {self.left_out[name]}")
@@ -186,7 +188,7 @@ def read_manifest(file: Path) -> Manifest:
         if file.suffix.lower() not in READERS or (file.exists() and not file.is_file()):  # a pipe never ends
             raise ValueError(f"it is no file of {', '.join(READERS)}")
         rows = READERS[file.suffix.lower()](file)
-    except (ValueError, OSError, csv.Error, pa.ArrowException) as error:  # ValueError: not UTF-8, too
+    except (ValueError, OSError, KeyError, csv.Error, pa.ArrowException) as error:  # ValueError: not UTF-8, too
         raise ValueError(f"{file} cannot be read as a table: {brief(error)}") from None
     texts = [{name: text_of(cell) for name, cell in row.items() if name} for row in rows]
     return Manifest.of(file, texts, digest=digest_file(file))
@@ -198,7 +200,9 @@ def _read_csv(file: Path) -> list[dict[str, Any]]:
         stream.seek(0)
         sign = next((sign for sign in ",;\t" if sign in header), ",")
         names, *lines = [line for line in csv.reader(stream, delimiter=sign) if line] or [[]]
-    names = _differing([name.strip() for name in names])
+    names = [name.strip() for name in names]
+    if len(set(names)) < len(names):
+        raise ValueError(f"it has two columns of one name: {', '.join(names)}")
     for number, line in enumerate(lines, 1):
         if len(line) != len(names):
             raise ValueError(f"row {number} has {len(line)} cells for {len(names)} columns: quote cells with commas")
@@ -207,14 +211,7 @@ def _read_csv(file: Path) -> list[dict[str, Any]]:
 
 def _read_parquet(file: Path) -> list[dict[str, Any]]:
     table = pq.ParquetFile(file).read()
-    _differing(table.column_names)
-    return table.to_pylist()
-
-
-def _differing(names: list[str]) -> list[str]:
-    if len(set(names)) < len(names):
-        raise ValueError(f"it has two columns of one name: {', '.join(names)}")
-    return names
+    return table.select(table.column_names).to_pylist()  # KeyError for two columns of one name
 
 
 def _read_jsonl(file: Path) -> list[dict[str, Any]]:

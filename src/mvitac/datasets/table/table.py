@@ -146,10 +146,9 @@ class RowsConfig(DatasetConfig, ABC):
             for text in texts:
                 column, _, listed = text.partition("=")
                 numbers = [number for part in listed.split(":") if (number := number_of(part)) is not None]
-                good = len(numbers) == many == listed.count(":") + 1 and (
-                    many == 2 or all(n == int(n) for n in numbers)
-                )
-                if not good or (numbers[0] >= numbers[1] if many == 2 else min(numbers) < 0 or not all(numbers[2:])):
+                good = len(numbers) == many == listed.count(":") + 1
+                pixels = listed.replace(":", "").isdecimal() and all(numbers[2:])
+                if not good or not (numbers[0] < numbers[1] if many == 2 else pixels):
                     raise ValueError(f"{text!r}: write COLUMN={'x:y:width:height' if many == 4 else 'LOW:HIGH'}")
                 looks.setdefault(column, {})[name] = tuple(map(int, numbers) if many == 4 else numbers)
         return looks
@@ -207,8 +206,6 @@ class Rows(Source):
         used = (*label_columns, *targets, self._group, *({self._split} - {BY_GROUP}), self._sensor, config.touch_group)
         used += (*config.conditioned(), *(c for used in config.control_columns().values() for c in used))
         table.check(*used)
-        for column in {*used} & {*table.images} - {*table.rows[0]}:
-            raise ValueError(f"{table.path}: column {column!r} holds images, not text or numbers: name another")
 
         table, grounds = self._select(table)
         asked = {"vision": self._images[: bool(self._vision)], "touch": self._touch}
@@ -265,10 +262,10 @@ class Rows(Source):
         """Return the rows that become samples with their images, and the background of each (none for raw images)."""
         config, grounds = self._config, self._config.background or ("background",)
         shown = (*self._images, *(grounds if config.difference and not config.no_contact else ()))
-        table.check(*shown)
+        table.check(*shown, images=True)
         table = table.resolved(shown, {*self._images, *grounds})
         if (looks := config.looks()) or config.bgr:
-            table.check(*looks)
+            table.check(*looks, images=True)
             like = dict(zip(grounds, self._touch, strict=False))  # a background is cropped as its touch
             how = {column: looks.get(like.get(column, column), {}) | {"bgr": config.bgr} for column in shown}
             seen = {c: [ref and replace(ref, **how[c]) for ref in refs] for c, refs in table.images.items()}
