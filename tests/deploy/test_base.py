@@ -49,8 +49,8 @@ def test_base_is_exported_on_a_few_rows_and_only_if_it_can_be_used(
     assert main(["predict", "base", ".", "--out", "x.csv"]) == 2 and not opened
     assert "takes vision and touch" in capsys.readouterr().err
     model = mvitac.load("base")
-    own_data(model, "", few=True)
-    assert opened == [replace(model.run.data, num=1000)]
+    own_data(model, "", few=100)
+    assert opened == [replace(model.run.data, num=100)]
 
 
 def test_a_report_of_base_is_not_in_the_package(

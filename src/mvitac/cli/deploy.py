@@ -72,7 +72,7 @@ def export(argv: list[str]) -> None:
 
     model = load(options.model)
     how = "check the export on a pack, --on PACK"
-    pack = Pack(options.on) if options.on else own_data(model, how, few=bool(model.probes))
+    pack = Pack(options.on) if options.on else own_data(model, how, few=1000 * bool(model.probes))
     pack = as_trained(model, pack)
     print("writing and checking the export takes up to a minute", flush=True)
     with shown():

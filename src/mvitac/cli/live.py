@@ -265,7 +265,7 @@ def _engine(model: str, threads: int, modalities: tuple[Any, ...] = (), *, most:
     if not folder.exists():
         _say(f"exporting {model}, once")
         how = "`mvitac export MODEL --on PACK --out DIR` first, and give DIR"
-        pack = own_data(loaded, how, few=bool(loaded.probes))
+        pack = own_data(loaded, how, few=100 * bool(loaded.probes))
         with shown():
             export(with_probes(loaded, pack), pack, folder, ExportConfig(modalities=modalities))
     return Engine(folder, threads=threads)

@@ -55,6 +55,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"mvitac: stopped{_continued(arguments)}", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # whoever read the output has enough, as in `mvitac live ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except (ValueError, OSError, MemoryError) as error:
         text = " ".join(str(error).split()) or type(error).__name__
         if arguments[0] == "data":  # here the options of a dataset are --path, not --data.path as for pretrain

@@ -31,7 +31,6 @@ from mvitac.system.locks import new_folder
 from mvitac.system.progress import work
 from mvitac.system.sealed_folder import ARTIFACT
 
-NUM_SIMULATED = 1000  # 400 test rows of ``materials`` with two sensors per press
 NUM_RANGES, RANGE_ROWS = 8, 20
 """Most ranges of a predicted value that have an error of their own, and fewest test rows in one."""
 
@@ -118,15 +117,15 @@ def _controls(model: Model, pack: Pack, records: Records) -> Records:
     return controls
 
 
-def own_data(model: Model, instead: str, *, few: bool = False) -> Pack:
+def own_data(model: Model, instead: str, *, few: int = 0) -> Pack:
     """The data ``model`` was trained on; the ValueError where it cannot be opened ends with ``instead``, what to do.
 
-    ``few``: of simulated data, which may have to be made first, only the first ``NUM_SIMULATED`` items. Splits are the same.
+    ``few``: of simulated data, which may have to be made first, only so many items. Splits are the same.
     """
     data = model.run.data
     try:
         if few and isinstance(data, SimulatedConfig):
-            return replace(data, num=min(data.num, NUM_SIMULATED)).open()
+            return replace(data, num=min(data.num, few)).open()
         return model.open_data()
     except ValueError as error:
         raise ValueError(f"the data this model was trained on is not here ({brief(error)}): {instead}") from None

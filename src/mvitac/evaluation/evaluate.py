@@ -99,8 +99,7 @@ def probe_runs(
         tested = [f"{session.folds} folds: every {pack.spec.group_by} that no run learned from is tested once"]
     else:
         (records, retrieval), tested = score(pack, others, tasks), []
-    every = [*records, *retrieval]
-    leaks = [*leaks_of(every), *([] if session.folds else mark_split_leaks(pack, every))]
+    leaks = [*leaks_of(every := [*records, *retrieval]), *([] if session.folds else mark_split_leaks(pack, every))]
     classes = {task.name: list(task.classes) for task in tasks if isinstance(task, Task)}
     result = {
         **{"data": pack.spec.name, "pack": pack.digest, "group_by": pack.spec.group_by},

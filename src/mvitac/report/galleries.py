@@ -6,6 +6,7 @@ import numpy as np
 from markupsafe import Markup
 
 from mvitac.data.pack_table import SPLITS
+from mvitac.deploy.search import unit
 from mvitac.evaluation.features import features, sample
 from mvitac.evaluation.retrieval import retrieved_rows
 from mvitac.report import figures
@@ -18,38 +19,54 @@ NUM_ROWS, NUM_QUERIES, NUM_FOUND = 1500, 8, 5
 
 def nearest_rows(values: np.ndarray, groups: np.ndarray, num: int = NUM_FOUND) -> np.ndarray:
     """Of each of N rows, its nearest row by cosine of ``values`` [N, D] in each of the ``num`` nearest other ``groups``."""
-    unit = values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12)
-    order = np.argsort(-np.where(groups[:, None] == groups, -np.inf, unit @ unit.T), axis=1, kind="stable")
+    alike = np.where(groups[:, None] == groups, -np.inf, unit(values) @ unit(values).T)
+    order = np.argsort(-alike, axis=1, kind="stable")
     firsts = (np.sort(np.unique(groups[row], return_index=True)[1])[:num] for row in order)  # the own group is last
     return np.stack([row[first] for row, first in zip(order, firsts, strict=True)])
 
 
+def spread(values: np.ndarray, num: int) -> np.ndarray:
+    """``num`` of N rows, each the least like all before by cosine of ``values`` [N, D], after the most typical one.
+
+    K-center greedy (arXiv:1708.00489).
+    """
+    alike = unit(values) @ unit(values).T
+    chosen = [int(alike.sum(1).argmax())]
+    while len(chosen) < min(num, len(values)):
+        chosen.append(int(alike[chosen].max(0).argmin()))
+    return np.array(chosen)
+
+
 def mistakes(study: Study) -> list[Markup]:
-    """Random rows whose nearest row has another class, with the nearest; without any labels, random rows."""
+    """Random rows whose nearest row has another class, with the nearest; without any labels, rows to label first."""
     (split, shown), pack = study.rows(), study.pack
-    rows = np.union1d(shown := sample(shown, NUM_ROWS), sample(retrieved_rows(pack, *SPLITS), NUM_ROWS))
+    known = bool((study.labels(np.arange(pack.num)) >= 0).any())
+    rows = sample(retrieved_rows(pack, *SPLITS), NUM_ROWS)
+    rows = np.union1d(shown := sample(shown, NUM_ROWS), rows) if known else rows
     groups, labels = pack.column("group")[rows].astype(str), study.labels(rows)
-    if (num := min(NUM_FOUND, len(np.unique(groups)) - 1)) == 0:
-        return []
-    halves, known, asked = [], bool((labels >= 0).any()), np.isin(rows, shown)
+    num = min(NUM_FOUND, len(np.unique(groups)) - 1)
+    halves, asked = [], np.isin(rows, shown)
     shared = [label for label in np.unique(labels) if len(np.unique(groups[labels == label])) > 1]
     for modality in pack.spec.modalities:
-        near = nearest_rows(features(study.runs[0].model, pack, modality, rows), groups, num)
-        wrong = np.isin(labels, shared) & (labels >= 0) & (labels[near[:, 0]] != labels) if known else labels < 0
+        near = nearest_rows(values := features(study.runs[0].model, pack, modality, rows), groups, num)
+        wrong = asked & np.isin(labels, shared) & (labels >= 0) & (labels[near[:, :1]] != labels[:, None]).any(1)
         strips = []
-        for at in sample(np.flatnonzero(asked & wrong), NUM_QUERIES).tolist():
+        for at in (sample(np.flatnonzero(wrong), NUM_QUERIES) if known else spread(values, NUM_QUERIES)).tolist():
             kinds = ("" if labels[i] < 0 else "same class" if labels[i] == labels[at] else "other" for i in near[at])
             found = list(zip(rows[near[at]].tolist(), kinds, strict=True))
             strips.append(_strip(study, modality, int(rows[at]), found))
-        title = f"{modality}: {(asked & wrong).sum()} of {len(shown)} rows" if known else modality
+        title = f"{modality}: {wrong.sum()} of {len(shown)} rows" if known else modality
         halves.append(html.card(title, strips))
     by, name = pack.spec.group_by, study.runs[0].path.name
-    whose = f" whose nearest row of another {by} is of another {pack.spec.tasks[0].name}" if known else ""
-    intro = (
-        f"{split} rows{whose}, drawn at random (seed 0). Left: the row. Then, best first, the nearest row of each of the"
-        f" {num} nearest other {by}s of any split, by features of the same modality ({name})."
+    intro = f"Each row is the one least like all above it{', so label these first' * (not pack.spec.all_tasks)}."
+    if known:
+        which = f"whose nearest row of another {by} is of another {pack.spec.tasks[0].name}"
+        intro = f"{split.capitalize()} rows {which}, drawn at random (seed 0)."
+    intro += (
+        f" Left: the row. Then, best first, the nearest row of each of the {num} nearest other {by}s of any split, by"
+        f" features of the same modality ({name})."
     )
-    return [html.paragraph(intro[0].upper() + intro[1:]), html.grid(halves, "queries")]
+    return [html.paragraph(intro), html.grid(halves, "queries")]
 
 
 _SHOWN = {"": ("", ""), "other": ("wrong", "\u2715 another class"), "same class": ("same", "\u2248 same class")}

@@ -68,7 +68,7 @@ def print_summary(result: dict[str, Any], file: TextIO | None = None, *, probe: 
         if score == "R2":
             print(_targets(name, task), file=file)
         if clipped := clipped_text(task):
-            print(clipped, file=file)
+            print(textwrap.fill(clipped, 80, subsequent_indent="  "), file=file)
     _print_notes(result, trained, file)
     if 1 < few < 10 and result.get("asked", {}).get("folds") == 0:  # of probe
         hint = f"hint: {few} test {by}s tell little: --folds {min(5, few)} tests every {by} no run learned from"
