@@ -1,6 +1,7 @@
 # Common commands. `make demo` and `make test` create .venv if it does not exist.
 PYTHON ?= python3
 BIN := .venv/bin
+TESTS ?= not slow
 
 .PHONY: demo test check bench difficulty docs notebooks pins clean
 
@@ -22,8 +23,8 @@ KEEP := import torch, torchvision, sys; sys.exit(tuple(map(int, torch.__version_
 demo: .venv/ready  ## pre-train, probe and report on simulated data (minutes on two cores)
 	$(BIN)/mvitac demo --out runs/demo
 
-test: .venv/ready  ## the test suite, on all cores
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal
+test: .venv/ready  ## the tests, on all cores; TESTS= runs the slow ones, too, as .ci/run does
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal -m "$(TESTS)"
 
 check: .venv/ready  ## linter, formatter, types and import contract
 	$(BIN)/ruff check .

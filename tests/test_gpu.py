@@ -32,6 +32,7 @@ def commands(monkeypatch):
     return ran
 
 
+@pytest.mark.slow
 def test_a_rehearsal_measures_all_and_goes_on_elsewhere(commands, tmp_path, monkeypatch):
     def call(out: str, work: str, *more: str) -> dict[str, Any]:
         folders = ["--out", str(tmp_path / out), "--work", str(tmp_path / work)]

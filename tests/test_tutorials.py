@@ -17,6 +17,8 @@ from PIL import Image
 from mvitac.data.pack import Pack
 from support.processes import begin, finish
 
+pytestmark = pytest.mark.slow
+
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted(p for p in (DOCS / "tutorials").glob("*.md") if p.name != "index.md")
 

@@ -103,6 +103,7 @@ def test_pretrain_starts_nothing_without_data(options: list[str], capsys: pytest
     assert all(word in said for word in ("--data", "folder", "--from RUN.JSON", "mvitac demo"))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -142,6 +142,7 @@ def open_int8(said: Path, folder: Path, ones: Path) -> None:
     said.write_text(str(float(np.abs(found - 1).max())))
 
 
+@pytest.mark.slow
 def test_int8_on_a_cpu_without_vnni(int8: Path, tmp_path: Path) -> None:
     """There sums of pairs of 8-bit products are cut off: the mean of 576 ones would be about a half."""
     import onnx

@@ -32,6 +32,7 @@ from mvitac.sim.sensors import SENSORS
 from mvitac.training.loop import train
 from support.faults import Clock
 
+pytestmark = pytest.mark.slow
 OPTION = "--new-sensor"
 
 

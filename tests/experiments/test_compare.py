@@ -541,6 +541,7 @@ def two_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "plan.toml"
 
 
+@pytest.mark.slow
 def test_folds_are_run_apart_and_pooled(two_folds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     main(["compare", "--plan", str(two_folds), "--out", str(out)])

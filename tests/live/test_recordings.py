@@ -138,6 +138,9 @@ def test_predict_command(
     said = capsys.readouterr().err
     assert "p.csv, 36 frames" in said and "14 frames are left out" in said  # half a second after the camera's last
     assert pyarrow.csv.read_csv(out).column("frame").to_pylist() == list(range(36))
+    (tmp_path / "short_timestamps.txt").write_text("\n".join(map(str, range(12))))  # a frame a second
+    assert main([*command, "--vision", str(short), *both[2:], "--out", str(out)]) == 0
+    assert "p.csv, 50 frames" in capsys.readouterr().err
     assert main([*command, str(pack.path), "--out", str(out)]) == 0
     assert pyarrow.csv.read_csv(out).num_rows == pack.num
     for m in ("vision", "touch"):

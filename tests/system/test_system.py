@@ -112,6 +112,7 @@ def test_probes_do_not_depend_on_it(
     assert scores(2) == scores(1)
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_or_goes_unnoticed(tmp_path: Path) -> None:
     argv = ["kills", "flips", "--commands", "pretrain", "--points", "2", "--num", "5"]
     finish(begin(main, argv, output=tmp_path / "said"), tmp_path / "said")

@@ -21,6 +21,8 @@ from support.distributed_steps import METHODS, build, main, run_of, third_step, 
 from support.processes import begin
 from support.small_steps import assert_close, views
 
+pytestmark = pytest.mark.slow
+
 
 def together(folder: Path, *words: str, num: int = 2, fails: bool = False) -> None:
     """Run the worker in ``num`` processes that find each other as torchrun's would."""
@@ -72,7 +74,6 @@ def test_two_processes_equal_one_on_the_joint_batch(pair: Path, method: str) -> 
     assert_close(resumed, first["weights"], 1e-3)
 
 
-@pytest.mark.slow
 def test_the_loop_shares_rows_writes_once_and_resumes_bit_for_bit(pack: Pack, tmp_path: Path) -> None:
     straight, cut = tmp_path / "straight", tmp_path / "cut"
     together(tmp_path, "train", str(pack.path), str(straight), "99")

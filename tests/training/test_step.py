@@ -146,7 +146,8 @@ def test_towers_side_by_side_are_those_of_one_thread(monkeypatch: pytest.MonkeyP
     assert draws_random_numbers(build()) and not draws_random_numbers(build(run))  # with dropout they are not
 
 
-@pytest.mark.parametrize("name", ["mvitac", *[pytest.param(name, marks=pytest.mark.slow) for name in ("mae", "ijepa")]])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mvitac", "mae", "ijepa"])
 def test_a_compiled_step_is_one_graph(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """As ``--compile`` asks torch for it; without machine code, which takes a minute."""
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))

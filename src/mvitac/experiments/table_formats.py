@@ -19,7 +19,6 @@ from mvitac.report.tables import RETRIEVAL, probe_name, retrieval_rows
 from mvitac.system.files import write_atomic, write_json
 
 TARGETS = "every target, and its mean absolute error"
-VALUES = ("score", "target", "unit", "mae", "rmse")  # columns of the CSV if there are tasks with values
 
 
 def write_tables(result: dict[str, Any], out: Path) -> list[Path]:
@@ -191,8 +190,7 @@ def _tabular(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def comma(result: dict[str, Any]) -> str:
     """Every cell of every probe as one CSV line, in 0 .. 1. A source with one probe (majority) appears once.
 
-    If there are tasks with values, further columns name the score and the target, with its unit and errors. A line without
-    a target is the mean over targets.
+    Of values, the last columns name the target, with its unit and errors. A line without one is the mean over targets.
     """
     probes: dict[tuple[str, str], list[str]] = {}  # of a source and a task
     for record in result["records"]:
@@ -207,10 +205,8 @@ def comma(result: dict[str, Any]) -> str:
                 known = probes[line.source, whole or name]
                 key = line.source, probe if probe in known else known[0], line.modality, whole or name, name
                 rows.setdefault(key, _csv_row(key, cell, line.control, bool(whole)))
-    classes = not any("targets" in record for record in result["records"])
-    heads = [head for head in next(iter(rows.values())) if not (classes and head in VALUES)]
     buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, heads, extrasaction="ignore", lineterminator="\n")
+    writer = csv.DictWriter(buffer, next(iter(rows.values())), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows.values())
     return buffer.getvalue()

@@ -13,10 +13,10 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
+from sklearn.metrics import ConfusionMatrixDisplay
 
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import percent
@@ -143,31 +143,19 @@ def curves(title: str, lines: Sequence[Line], references: Mapping[str, float] | 
 
 @matplotlib.rc_context(STYLE)
 def confusion(title: str, counts: np.ndarray, classes: Sequence[str]) -> Figure:
-    """Row-normalised confusion matrix of ``counts`` [true, predicted]; correct cells blue, mistakes vermilion."""
+    """Confusion matrix of ``counts`` [true, predicted], each row in percent."""
     num = len(classes)
     figure, axes = new_figure(title, 3.4 if num <= 4 else 4.3)
-    shares = counts / np.maximum(counts.sum(1, keepdims=True), 1)
-    hues = np.where(np.eye(num, dtype=bool)[..., None], to_rgb(COLOURS["blue"]), to_rgb(COLOURS["vermilion"]))
-    # Never opaque under a number.
-    alpha = np.where(shares > 0, 0.12 + (0.58 if num <= NUM_NUMBERED else 0.88) * shares, 0)
-    edges, look = np.arange(num + 1) - 0.5, {"edgecolors": COLOURS["panel"], "linewidth": 2 * (num <= 8) or num <= 40}
-    axes.pcolormesh(edges, edges, np.dstack([hues, alpha]), **look)
-    size: dict[str, Any] = {"fontsize": 110 / num} if num > 8 else {}
-    for true, guess in zip(*np.nonzero(shares), strict=True) if num <= NUM_NUMBERED else ():
-        text = f"{100 * shares[true, guess]:.0f}{' %' * (num <= 4)}"
-        axes.text(guess, true, text, ha="center", va="center", **size)
-    axes.set_xlim(-0.5, num - 0.5)
-    axes.set_ylim(num - 0.5, -0.5)
-    axes.set_aspect("equal")
-    axes.spines[["left", "bottom"]].set_visible(False)
-    if num <= 40:
-        letters = 9 if num <= 8 else 7.5 if num <= 24 else 5
-        names = [shorten(name, 14) for name in classes]
-        axes.set_xticks(range(num), names, rotation=0 if num <= 4 else 90, fontsize=letters)
-        axes.set_yticks(range(num), names, fontsize=letters)
-    else:
-        axes.set_xticks([])
-        axes.set_yticks([])
+    shares = 100 * counts / np.maximum(counts.sum(1, keepdims=True), 1)
+    shown = ConfusionMatrixDisplay(shares, display_labels=[shorten(name, 14) for name in classes])
+    look: dict[str, Any] = {"include_values": num <= NUM_NUMBERED, "values_format": ".0f", "colorbar": False}
+    look |= {"text_kw": {"fontsize": min(9, 110 / num)}, "im_kw": {"vmin": 0, "vmax": 100}}
+    shown.plot(ax=axes, cmap="Blues", xticks_rotation=0 if num <= 4 else 90, **look)
+    for cell in [] if shown.text_ is None else shown.text_.ravel():
+        cell.set_visible(cell.get_text() != "0")
+    axes.tick_params(labelsize=9 if num <= 8 else 7.5 if num <= 24 else 5)
+    if num > 40:
+        axes.set(xticks=[], yticks=[])
     axes.set(xlabel="predicted", ylabel="true")
     return figure
 

@@ -191,5 +191,5 @@ def confusions(study: Study) -> list[Markup]:
         drawn.append(study.figure(f"confusion {task}", drawing, alt, caption))
     if not drawn:
         return []
-    intro = f"Each row is a true class and sums to 100 %: blue is correct, orange is a mistake ({source})."
+    intro = f"Each row is a true class and sums to 100 % ({source})."
     return [html.paragraph(intro), html.grid(drawn)]

@@ -18,17 +18,9 @@ def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> lis
     Use it for CPU work that releases the GIL and does not use global random generators, such as forward passes of different
     models. Several tasks with few threads each are faster than one task with many.
     """
-    threads = torch.get_num_threads()
-    num = min(len(items), 2 * threads)
-    if threads < 2 or num < 2:
-        return [function(item) for item in items]
-    share = max(1, threads // num)
-    torch.set_num_threads(share)
-    try:
-        with ThreadPoolExecutor(num, initializer=torch.set_num_threads, initargs=(share,)) as pool:
-            return list(pool.map(function, items))
-    finally:
-        torch.set_num_threads(threads)
+    if torch.get_num_threads() < 2:
+        return list(map(function, items))
+    return _at_once([partial(function, item) for item in items])
 
 
 def in_branches(branches: Sequence[Callable[[], dict[Hashable, Tensor]]]) -> dict[Hashable, Tensor]:
@@ -86,7 +78,7 @@ def _at_once(calls: Sequence[Callable[[], Result]]) -> list[Result]:
     share = max(1, threads // max(1, len(calls)))
     torch.set_num_threads(share)
     try:
-        others = [_pool(len(calls) - 1, share).submit(call) for call in calls[1:]]
+        others = [_pool(min(len(calls) - 1, 2 * threads), share).submit(call) for call in calls[1:]]
         return [calls[0](), *(other.result() for other in others)] if calls else []
     finally:
         torch.set_num_threads(threads)

@@ -93,7 +93,7 @@ def time_offset(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     mean, error = curves.mean(0), curves.std(0, ddof=1) / len(curves) ** 0.5
     lag = int(mean.argmax()) - MAX_LAG
     best = lag + MAX_LAG
-    if mean[best] < 0.3 or mean[best] < 3 * error[best]:
+    if mean[best] < 0.3 or mean[best] < 3 * error[best]:  # streams of other recordings gave up to .25
         return cannot(f"motion in vision and touch is unrelated (at best r = {mean[best]:.2f} at lag {lag})")
     gain = curves[:, best] - curves[:, MAX_LAG]
     certain = lag != 0 and gain.mean() > 3 * gain.std(ddof=1) / len(gain) ** 0.5 and gain.mean() > 0.05
