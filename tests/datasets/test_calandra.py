@@ -94,12 +94,6 @@ def test_every_image_is_in_its_place(folder: Path, packed: Pack) -> None:
     assert packed.num == 3 * 24  # two of the 26 grasps are of an object outside the 40
 
 
-def test_two_processes_give_the_bytes_of_one(folder: Path, packed: Pack, tmp_path: Path) -> None:
-    config = CalandraConfig(path=folder, size=24)
-    with_two = build(config.source(), tmp_path / "two", size=24, workers=2, quiet=True)
-    assert with_two.digest == packed.digest
-
-
 def test_a_pack_depends_on_what_the_shards_hold_and_when_they_were_written(folder: Path, tmp_path: Path) -> None:
     root = shutil.copytree(folder, tmp_path / "elsewhere")
     one, other = CalandraConfig(path=folder), CalandraConfig(path=root, workers=3)

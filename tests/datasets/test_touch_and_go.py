@@ -226,10 +226,6 @@ def test_jpegs_and_videos_give_the_same_pairs(official: Pack, tmp_path: Path) ->
     assert pack.table.drop_columns(pixels).equals(official.table.drop_columns(pixels))
 
 
-def test_two_workers_give_the_pack_of_one(official: Pack, tree: Path, tmp_path: Path) -> None:
-    assert packed(tree, tmp_path / "two", split="official", workers=2).digest == official.digest
-
-
 # -- labels, splits, touches ------------------------------------------------------------------------------------------
 
 
