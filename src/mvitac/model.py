@@ -288,9 +288,7 @@ class Model(nn.Module):
     def open_data(self, *, quiet: bool = False) -> Pack:
         """Open the data that the model was trained on; ValueError if it is not here, or ``foreign`` names its place."""
         if self.foreign and self.run.data.names_a_place:
-            raise ValueError(
-                "an artifact may be a stranger's, so its data's place is not opened: name a pack, --on PACK"
-            )
+            raise ValueError("an artifact may be a stranger's: its data is not opened by its path, give --on PACK")
         return self.run.data.open(quiet=quiet)
 
     def weights_digest(self) -> str:

@@ -203,9 +203,6 @@ def test_changed_fields_are_checked() -> None:
     assert slug("Calandra et al., supervised") == "calandra-et-al.-supervised"
 
 
-# -- runs and tables --------------------------------------------------------------------------------------------------
-
-
 def test_result_and_tables_agree(done: tuple[Path, dict]) -> None:
     out, result = done
     ends = ("md", "tex", "csv")

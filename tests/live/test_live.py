@@ -416,6 +416,8 @@ def test_each_artifact_of_a_run_is_exported_for_itself(
     for model in (artifact, other, artifact):
         assert _engine(str(model), 1).classes.keys() == {"pattern", "bright"}
     assert made == [("columns", "rows", "checks"), ("checks", "rows", "columns")]
+    with pytest.raises(ValueError, match="no input for depth: leave --depth out"):
+        _engine(str(artifact), 1, ("depth",))
 
 
 def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

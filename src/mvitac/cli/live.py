@@ -258,6 +258,8 @@ def _engine(model: str, threads: int, modalities: tuple[Any, ...] = (), *, most:
 
     loaded = load(model)
     check(modalities or loaded.encoders)  # before the export, which takes longer
+    for m in {*modalities} - {*loaded.encoders}:
+        raise ValueError(f"the model has no input for {m}: leave --{m} out")
     # Artifacts of one run differ in their probes only. A run has none: its data decides those that are fitted below.
     probes = [[to_json(r.info), safetensors_digest(dict(r.state_dict()))] for r in loaded.probes.values()]
     key = digest([EXPORT.version, loaded.weights_digest(), probes, *modalities])
@@ -275,9 +277,8 @@ def _say_uncropped(engine: Engine, given: Mapping[str, Sequence[str | None]]) ->
     """Warn of sources that are used whole, although the model's data showed a part."""
     for m, part in engine.crop.items():
         if any("#" not in f"{text}" and not f"{text}".startswith("sim") for text in given.get(m, ())):
-            _say(
-                f"mvitac: warning: {m} is used whole, the model learned from {part}: add that to SOURCE, #x:y:width:height"
-            )
+            how = "add that to SOURCE, #x:y:width:height"
+            _say(f"mvitac: warning: {m} is used whole, the model learned from {part}: {how}")
 
 
 def _say(text: str) -> None:

@@ -103,9 +103,7 @@ def to_rgb(image: Image.Image, span: Sequence[float] | None = None) -> Image.Ima
         image = ImageOps.exif_transpose(image)
     if image.mode.startswith("I") or image.mode == "F":  # PIL's own conversion clips instead
         if span is None:
-            raise ValueError(
-                "it has more than 8 bits, and a model does not know how its pack scaled them: pack it, too"
-            )
+            raise ValueError("it has more than 8 bits, and the model does not know how they were scaled: pack it, too")
         if image.mode == "F" and not span:
             raise ValueError("it holds floating-point values of unknown range: --data.range COLUMN=LOW:HIGH")
         return Image.fromarray(to_gray(np.asarray(image), span or (0, 65535), bool(span))).convert("RGB")

@@ -121,9 +121,7 @@ def probe_runs(
 
 def _check_names(runs: set[str], encoders: set[str], controls: set[str]) -> None:
     if alike := encoders & runs | (encoders | runs) & controls:
-        raise ValueError(
-            f"two rows would be called {min(alike)!r}: give a title=NAME, or pack with another control's name"
-        )
+        raise ValueError(f"two rows would be called {min(alike)!r}: give a title=NAME, or rename the data's control")
 
 
 def _check_paths(paths: Sequence[Path], encoders: Sequence[str]) -> None:

@@ -97,8 +97,9 @@ def pack_features(
     device = next(model.parameters()).device
     if device.type == "cpu":
         keep_freed_memory()  # else every activation is mapped again: over twice the time on a virtual machine
+    size = 64 if device.type == "cpu" else 256  # more leave the cache: with 256, EfficientNet takes 1.5 times as long
     chunks = []
-    for chunk in np.array_split(rows, max(1, len(rows) // 256)):
+    for chunk in np.array_split(rows, max(1, len(rows) // size)):
         images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
         chunks.append(model.features(modality, images, for_heads=for_heads, bf16=bf16).cpu())
         advance(len(chunk))

@@ -49,8 +49,8 @@ class Recordings(Source):
         rng = np.random.default_rng([11, item])
         force = 0.2 + (2.5 + 0.1 * (k // 2 % 4)) * np.sin(np.pi * i / LENGTH) + 0.01 * rng.normal()
         tilt = 0.3 * np.sin(k + i / 5)
-        if fault == "outlier" and item == 100:
-            force = 60.0
+        if fault == "outlier" and i == 5:
+            force = -999.0
         if fault == "stuck" and k == 4 and 10 <= i < 24:
             force = 2.0
         if fault == "outside" and k == 7:
@@ -82,7 +82,7 @@ def test_healthy_values(healthy: Pack) -> None:
 @pytest.mark.parametrize(
     ("fault", "item", "says", "rows"),
     [
-        ("outlier", "values of force", "1 outliers, e.g. 60 in row 100", [100]),
+        ("outlier", "values of force", "16 outliers, e.g. -999 in row 5", [5, 45]),
         ("stuck", "values of force", "1 constant stretches, the longest 14 frames of 2 from row 170", [170]),
         ("outside", "values of force", "test rows are outside train (0.1", []),
     ],

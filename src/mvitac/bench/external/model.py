@@ -178,9 +178,8 @@ class ExternalModel(Model):
         if not torch.isfinite(found).all():
             raise ValueError(f"{self.text} gives NaN or infinite features of {modality}: check weights, mean and std")
         if not (found == 0).all() and not 1e-3 < found.abs().max() < 1e12:  # probes add 1e-6 to a standard deviation
-            raise ValueError(
-                f"{self.text} gives features of {modality} up to {found.abs().max():.0e}: scale them to about 1"
-            )
+            largest = f"features of {modality} up to {found.abs().max():.0e}"
+            raise ValueError(f"{self.text} gives {largest}: scale them to about 1")
         return found
 
     def features_key(self, modality: str) -> str:

@@ -63,12 +63,16 @@ def _touches(pack: Pack) -> list[np.ndarray]:
 
 
 def _outliers(rows: np.ndarray, known: np.ndarray) -> Note:
-    """Values far outside the usual range."""
-    low, high = np.percentile(known, [1, 99])
-    far = np.maximum(known - high, low - known) > 1.5 * (high - low)
-    if high <= low or not far.any():
+    """At most 5 % of the values, beyond a gap twice as wide as the range of the others: such as -999 for "not measured"."""
+    far, num = np.zeros(len(known), bool), max(1, len(known) // 20)
+    for side in (known, -known):
+        ordered = np.sort(side)
+        inside, outside = ordered[-num - 1 : -1], ordered[-num:]
+        apart = outside[(outside - inside > 2 * (inside - ordered[num])) & (inside > ordered[num])]
+        far |= side >= apart.min(initial=np.inf)
+    if not far.any():
         return "", []
-    usual = f"(most are {low:.4g} to {high:.4g})"
+    usual = f"(the others are {known[~far].min():.4g} to {known[~far].max():.4g})"
     return f"{int(far.sum())} outliers, e.g. {known[far][0]:.4g} in row {rows[far][0]} {usual}", rows[far].tolist()
 
 
