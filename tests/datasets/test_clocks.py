@@ -106,11 +106,12 @@ def test_times_of_frames_may_stand_beside_the_video(tmp_path: Path) -> None:
     dates = [str(np.datetime64(round(t * 1e6), "us")) + "+00:00" for t in times]
     write_csv(tmp_path / "set/a_timestamps.csv", stamp=dates)
     (tmp_path / "set/b_timestamps.txt").write_text("\n".join(f"{t + 5:.3f}" for t in times))
-    log = START + np.arange(-1, 9, 0.01)
+    log = START + np.r_[-1:3:0.01, 4.5:9:0.01]  # nothing between the two
     write_csv(tmp_path / "logs.csv", ns=(log * 1e9).astype(int), Fz=force(log - START))
     pack = packed(tmp_path / "set", tmp_path / "p", log=("../logs.csv:ns",), values=("Fz:N",))
     frame, late = pack.column("frame").astype(int), 5 * (pack.column("recording") == "b")
     assert pack.num == 20 and np.allclose(pack.values(pack.spec.values[0])[:, 0], force(0.05 * frame + late), atol=1e-3)
+    assert "its largest gap is 0.01 s" in pack.spec.notes[0]
 
 
 def test_two_cameras_out_of_step_are_paired_by_time(tmp_path: Path) -> None:

@@ -170,8 +170,7 @@ def joined(
     good = away <= tolerance + 1e-9
     if not good.any():
         return [{} for _ in times], 0.0
-    near = (stamps >= np.nanmin(times) - tolerance) & (stamps <= np.nanmax(times) + tolerance)
-    gaps = np.diff(stamps[near], append=stamps[near][-1])
+    gaps = np.diff(stamps)[np.diff(np.searchsorted(np.sort(times), stamps)) > 0]  # of those between recordings none
     columns = {name: [log.rows[row][name] for row in order[at]] for name in log.rows[0]}
     for name in columns.keys() & set(smooth):
         known = np.array([_number(log, row, name) for row in order.tolist()])
@@ -184,7 +183,7 @@ def joined(
         far = f"{log.path}: stamps are {step:g} s apart"
         raise ValueError(f"{far}, more than --data.tolerance {tolerance:g} on both sides: are they seconds?")
     cells = [{name: texts[i] for name, texts in columns.items()} if good[i] else {} for i in range(len(times))]
-    return cells, float(gaps.max())
+    return cells, float(gaps.max(initial=0.0))
 
 
 def _number(log: Manifest, i: int, name: str) -> float:
