@@ -27,7 +27,7 @@ def base(seed: int, steps: int) -> Run:
     touch = replace(run.augment.touch, size=64, whole=96)
     return replace(
         run,
-        method=replace(run.method, lambda_sensor=1.0),
+        method=replace(run.method, lambda_sensor=1.0, lambda_inter=1.0),
         augment=replace(run.augment, touch=touch),
         optim=replace(run.optim, lr=2e-3),
         batch_size=64,

@@ -316,7 +316,7 @@ def test_sixteen_bits_are_scaled_not_clipped(tmp_path: Path) -> None:
         image = np.asarray(decode(tmp_path / name, span=()))
         assert image.dtype == np.uint8 and image.shape == (16, 16, 3) and (image[..., 1] == image[..., 2]).all()
         assert (image[..., 0].ravel() == np.arange(256)).all()
-        with pytest.raises(ValueError, match="a model does not know how its pack scaled them"):
+        with pytest.raises(ValueError, match="the model does not know how they were scaled"):
             decode(tmp_path / name)
     Image.fromarray(np.zeros((9, 9, 3), np.uint8)).save(tmp_path / "rgb.png")
     with pytest.raises(ValueError, match="read as RGB of 8 bits"):

@@ -149,8 +149,9 @@ def confusion(title: str, counts: np.ndarray, classes: Sequence[str]) -> Figure:
     shares = 100 * counts / np.maximum(counts.sum(1, keepdims=True), 1)
     shown = ConfusionMatrixDisplay(shares, display_labels=[shorten(name, 14) for name in classes])
     look: dict[str, Any] = {"include_values": num <= NUM_NUMBERED, "values_format": ".0f", "colorbar": False}
+    look["xticks_rotation"] = 0 if num <= 4 else 90
     look |= {"text_kw": {"fontsize": min(9, 110 / num)}, "im_kw": {"vmin": 0, "vmax": 100}}
-    shown.plot(ax=axes, cmap="Blues", xticks_rotation=0 if num <= 4 else 90, **look)
+    shown.plot(ax=axes, cmap="Blues", **look)
     for cell in [] if shown.text_ is None else shown.text_.ravel():
         cell.set_visible(cell.get_text() != "0")
     axes.tick_params(labelsize=9 if num <= 8 else 7.5 if num <= 24 else 5)
