@@ -31,7 +31,7 @@ def main(path: Path) -> None:
         rows = split_rows(pack, task)
         for kind in ("linear", "curve"):
             about = {"source": "contact energy", "seed": 0, "task": task.name, "modality": "touch", "probe": kind}
-            record = {**about, **probe_features(energy[rows.all], pack, task, rows, kind, 0)}
+            record = {**about, **probe_features(energy[rows.all], pack, task, rows, kind, 0)[0]}
             errors = ", ".join(f"{t['name']} {t['mae']:.2f} {t['unit']}" for t in record["targets"])
             print(f"{task.name:10} {kind:8} R2 {with_interval(*interval([record]))}  MAE {errors}", flush=True)
 

@@ -40,7 +40,7 @@ def left_out(pack: Pack, name: str, x: np.ndarray, kind: str = "linear") -> None
         task = fold.spec.values[0]
         rows = split_rows(fold, task)
         about = {"source": name, "seed": 0, "task": task.name, "modality": "touch", "probe": kind}
-        folds.append([{**about, **probe_features(x[rows.all], fold, task, rows, kind, 0)}])
+        folds.append([{**about, **probe_features(x[rows.all], fold, task, rows, kind, 0)[0]}])
     (whole,) = pool(folds)
     apart = " ".join(percent(fold[0]["r2"]) for fold in folds)
     print(

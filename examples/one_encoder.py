@@ -172,7 +172,7 @@ def records_of(source: str, seed: int | None, packs: list[Pack], xs: dict[str, n
         for modality in [*xs, *(["both"] if len(xs) > 1 else [])]:
             x = np.concatenate([xs[m] for m in ([modality] if modality != "both" else xs)], axis=1)[rows.all]
             about = {"source": source, "seed": seed, "task": task.name, "modality": modality, "probe": "linear"}
-            yield {**about, **probe_features(x, pack, task, rows, "linear", seed or 0)}
+            yield {**about, **probe_features(x, pack, task, rows, "linear", seed or 0)[0]}
 
 
 def score(source: str, seed: int | None, name: str, encoders: Encoders) -> list[dict[str, Any]]:

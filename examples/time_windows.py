@@ -80,7 +80,7 @@ def scored(pack: Pack, num_folds: int, about: dict[str, Any], x: np.ndarray) -> 
         records = []
         for task in fold.spec.tasks:
             rows = split_rows(fold, task)
-            found = probe_features(x[rows.all], fold, task, rows, "linear", about["seed"] or 0)
+            found = probe_features(x[rows.all], fold, task, rows, "linear", about["seed"] or 0)[0]
             records.append({**about, "task": task.name, "modality": "touch", "probe": "linear", **found})
         folds.append(records)
     return pool(folds)

@@ -1,7 +1,7 @@
 """mvitac: learn representations of paired camera and optical-tactile images without labels, and evaluate them.
 
     model = mvitac.load("runs/demo/seed0")                      # a run, an artifact, or owner/name on the Hub
-    features = model.embed(vision=photos, touch=presses)        # {"vision": [N, 512], "touch": [N, 512]}
+    features = model.embed(vision=photos, touch=presses)        # {"vision": [N, 1280], "touch": [N, 512]}
 
 Names are imported on first use, so that ``import mvitac`` is fast.
 """

@@ -1,7 +1,7 @@
 """The trained model: encoders, heads into the shared space, and the preprocessing of raw images.
 
     model = mvitac.load("runs/demo/seed0")
-    features = model.embed(vision=photos, touch=presses)      # {"vision": [N, 512], "touch": [N, 512]}
+    features = model.embed(vision=photos, touch=presses)      # {"vision": [N, 1280], "touch": [N, 512]}
     features = model(touch=batch)["touch"]                    # with gradients, for fine-tuning
 
 Shapes: N or B images, C channels, H x W pixels, D features, E dimensions of the shared space, K classes.
@@ -237,10 +237,8 @@ class Model(nn.Module):
         self._check_background("touch" if touch is not None else "vision", background)
         device, found = next(self.parameters()).device, {}
         for modality, value in given.items():
-            chunks = []
-            for batch in self.transform(modality).batches(
-                value, background if modality == "touch" else None, EMBED_BATCH
-            ):
+            chunks, own = [], background if modality == "touch" else None
+            for batch in self.transform(modality).batches(value, own, EMBED_BATCH):
                 features = self.features(modality, batch.to(device), for_heads=shared)
                 chunks.append(self.project(modality, features) if shared else features)
             found[modality] = torch.cat(chunks)

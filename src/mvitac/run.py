@@ -73,7 +73,7 @@ class Run:
         >>> import mvitac
         >>> run = replace(mvitac.recipe("quick"), steps=100, seed=1)
         >>> run.method.name, run.batch_size
-        ('mvitac', 64)
+        ('mvitac', 32)
     """
 
     recipe: Fixed[str] = "paper"

@@ -158,14 +158,8 @@ def test_probe_learns_on_one_pack_and_meets_another(
     result = json.loads((tmp_path / "new.json").read_text())
     assert result["pack"] == JoinedPack(pack, negative).digest
     assert {r["num_test"] for r in result["records"]} == {len(negative.rows("test"))}
-    assert {r["source"] for r in result["records"]} == {
-        "mvitac",
-        "imagenet",
-        "majority",
-        "untrained",
-        "pixels",
-        "border",
-    }
+    sources = {"mvitac", "imagenet", "majority", "untrained", "pixels", "border"}
+    assert {r["source"] for r in result["records"]} == sources
     assert "probes learned on" in capsys.readouterr().out
     assert main(["probe", str(tmp_path / "run"), "--learn-on", str(pack.path)]) == 2
     assert "name the pack on which they are scored, --on PACK" in " ".join(capsys.readouterr().err.split())

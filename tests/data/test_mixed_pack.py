@@ -43,18 +43,15 @@ def test_rows_are_those_of_the_parts(pack: Pack, gel: Pack) -> None:
     np.testing.assert_array_equal(mix.images["touch"][rows], expected)
     np.testing.assert_array_equal(mix.images["touch"][pack.num + 3], fit(small, 32))
     assert not mix.images["vision"][rows[0]].any() and mix.images["vision"][5].any()
-    assert "gel: images of 24 px are resized to 32 px when they are read" in mix.spec.notes
+    assert "gel: images of 24 px are resized to 32 px as they are read" in mix.spec.notes
     assert mix.spec.licence == "toy: none; gel: none"
     assert MixedPack({"toy": pack, "gel": gel}, size=16).images["touch"].shape[1:] == (16, 16, 3)
 
 
 def test_the_digest_is_of_parts_and_size(pack: Pack, gel: Pack) -> None:
     one = MixedPack({"a": pack, "b": gel})
-    others = [
-        MixedPack({"a": gel, "b": pack}),
-        MixedPack({"a": pack, "c": gel}),
-        MixedPack({"a": pack, "b": gel}, size=24),
-    ]
+    others = [MixedPack({"a": gel, "b": pack}), MixedPack({"a": pack, "c": gel})]
+    others.append(MixedPack({"a": pack, "b": gel}, size=24))
     assert MixedPack({"a": pack, "b": gel}).digest == one.digest
     assert len({one.digest, *(other.digest for other in others)}) == 4
 

@@ -131,14 +131,8 @@ def test_frames_without_an_order_are_refused(pack: Pack) -> None:
 def test_a_window_trains_probes_and_reloads(presses: Pack, tmp_path: Path, temporal: str) -> None:
     data = PackConfig(path=presses.path, num_frames=2)
     run = recipe("smoke", data)
-    run = replace(
-        run,
-        steps=2,
-        batch_size=8,
-        eval_every=0,
-        encoder=run.encoder.changed(temporal=temporal),
-        augment=Augment(size=16),
-    )
+    run = replace(run, steps=2, batch_size=8, eval_every=0, augment=Augment(size=16))
+    run = replace(run, encoder=run.encoder.changed(temporal=temporal))
     out = train(run, tmp_path / "run", quiet=True)
     model = load(out)
     assert model.spec.frames("touch") == 2 and model.spec.frames("vision") == 1

@@ -220,12 +220,12 @@ def test_a_replay_buffer_in_zarr(tmp_path: Path, kind: str) -> None:
     path: Any = tmp_path / ("b.zarr.zip" if kind == "zip" else "b.zarr")
     with zarr.storage.ZipStore(path, mode="w") if kind == "zip" else nullcontext(str(path)) as store:
         root = zarr.open_group(store, mode="w", zarr_format=3 if kind == "v3" else 2)
-        content = {
-            "data/camera": grays(*range(20)),
-            "data/gel": grays(*range(100, 120)),
+        content = {"data/camera": grays(*range(20)), "data/gel": grays(*range(100, 120))}
+        content |= {
             "data/force": np.arange(20) / 4,
+            "data/state": np.arange(40).reshape(20, 2),
+            "meta/episode_ends": np.array([4, 9, 14, 20]),
         }
-        content |= {"data/state": np.arange(40).reshape(20, 2), "meta/episode_ends": np.array([4, 9, 14, 20])}
         root.create_group("data", attributes={"robot": "arm"})
         for name, value in content.items():
             root.create_array(name, data=value)

@@ -214,7 +214,7 @@ def test_rows_with_one_stamp_are_counted(tmp_path: Path) -> None:
     own_times("txt", *(round(0.04 * i, 1) for i in range(50)))(root)
     pack = packed(root, tmp_path / "p", **LOG)
     note = next(note for note in pack.spec.notes if "joined" in note)
-    assert "of its rows have the stamp of another, of which one counts" in note
+    assert "of its rows have the stamp of another, of which one counts, and 1 of these say something else" in note
     for i in np.flatnonzero(pack.column("recording") == "0"):  # frames of one stamp are themselves
         assert abs(pack.images["touch"][i].mean() - shade(int(pack.column("frame")[i]), 0)) < 6
 

@@ -154,15 +154,11 @@ def test_cameras_are_chosen_or_guessed() -> None:
     assert choose(three, None, (), where) == {"left": "cam.tactile_l", "right": "cam.tactile_r", "vision": "cam.front"}
     assert choose(three, "", ("cam.front",), where) == {"cam.front": "cam.front"}
     assert choose(["a", "b"], "b", ("a",), where) == {"a": "a", "b": "b"}
-    assert choose(["front", "finger_cam", "gel"], "finger_cam", (), where) == {
-        "touch": "gel",
-        "finger_cam": "finger_cam",
-    }
+    found = choose(["front", "finger_cam", "gel"], "finger_cam", (), where)
+    assert found == {"touch": "gel", "finger_cam": "finger_cam"}
     assert choose(["front", "finger_cam"], "finger_cam", (), where) == {"finger_cam": "finger_cam"}  # never both senses
-    assert choose(["digital_front", "digit_left"], None, (), where) == {
-        "touch": "digit_left",
-        "vision": "digital_front",
-    }
+    found = choose(["digital_front", "digit_left"], None, (), where)
+    assert found == {"touch": "digit_left", "vision": "digital_front"}
     for vision, touch, says in (("cam.frnt", (), "did you mean 'cam.front'"), (None, ("x",), "unknown camera 'x'")):
         with pytest.raises(ValueError, match=says):
             choose(three, vision, touch, where)
@@ -199,10 +195,8 @@ def test_lerobot_reads_values_and_elements_of_vectors(tmp_path: Path) -> None:
     plain = LeRobotConfig(path=root, size=16).source()
     config = LeRobotConfig(path=root, size=16, values=("pose=observation.state[0]:mm,timestamp:s",))
     pack = packed(config, tmp_path / "pack")
-    assert [(t.name, t.unit) for t in pack.spec.values[0].targets] == [
-        ("observation.state[0]", "mm"),
-        ("timestamp", "s"),
-    ]
+    units = {t.name: t.unit for t in pack.spec.values[0].targets}
+    assert units == {"observation.state[0]": "mm", "timestamp": "s"}
     at = np.array([e * 100 + i for e, length in enumerate(LENGTHS) for i in range(length)])
     assert (pack.column("episode").astype(int) * 100 + pack.column("frame").astype(int) == at).all()
     values, _ = measured(pack)

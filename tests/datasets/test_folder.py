@@ -578,11 +578,12 @@ def test_commands_say_what_a_group_is(tmp_path: Path, rows: Table, capsys: pytes
     words = ["data", "pack", "--data", "folder", "--path", str(file), "--size", "16", "--quiet", "--labels", "material"]
     assert main([*words, "--out", str(tmp_path / "grouped"), "--group", "object"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    assert "groups: 8, one per object, of 3 rows each." in shown and "no --group" not in shown
+    assert "groups: 8, one per object, of 3 rows each. Each is one touch group, too" in shown
+    assert "no --group" not in shown
     assert main([*words, "--out", str(tmp_path / "forgotten")]) == 0
     for packed_now in (True, False):
         shown = " ".join(capsys.readouterr().out.split())
-        assert "groups: 24, one per row, of 1 row each. A split takes whole groups, and intervals resample" in shown
+        assert "groups: 24, one per row, of 1 row each. A split takes whole groups, and intervals are over" in shown
         assert "note: no --group was given, so every row is its own group" in shown
         assert shown.endswith("intervals too narrow (of those in test, also in train: object 4 of 4)")
         if packed_now:
@@ -607,7 +608,7 @@ def test_rows_that_share_something_are_told_where_no_group_is_given(tmp_path: Pa
         given.append({**names, "material": row["material"], "seq": row["seq"], "press": f"press {i // 2}"})
     file = write(given, tmp_path / "m.csv")
     (note,) = FolderConfig(path=file, labels=("material",), split_seed=1).source().spec().notes
-    assert re.search(r"also in train: press \d of \d, vision files 4 of 4\)$", note)
+    assert re.search(r"also in train: press \d of \d, names of vision files 4 of 4\)$", note)
     assert not FolderConfig(path=file, labels=("material",), group="press").source().spec().notes
     findings = examine_source(FolderConfig(path=file, labels=("material",), size=16).source(), quiet=True)
     assert [(f.verdict, f.item) for f in findings if "vision files" in f.evidence] == [("look", "groups")]

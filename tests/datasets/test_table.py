@@ -124,11 +124,8 @@ def test_videos_that_a_row_shows_side_by_side_are_one_group(films: Path) -> None
 
 
 def test_a_split_that_cuts_a_video_is_refused_and_seen_by_the_doctor(films: Path, tmp_path: Path) -> None:
-    rows = [
-        {"touch": f"{k}/gel.avi", "frame": i, "split": "test" if i > 8 else "train"}
-        for k in range(4)
-        for i in range(12)
-    ]
+    frames = [(k, i) for k in range(4) for i in range(12)]
+    rows = [{"touch": f"{k}/gel.avi", "frame": i, "split": "test" if i > 8 else "train"} for k, i in frames]
     config = FolderConfig(path=table(films / "cut.csv", rows), size=16)
     with pytest.raises(ValueError, match=r"4 of 4 groups \(video\) are in more than one split, e\.g\. '0/gel\.avi'"):
         config.source()

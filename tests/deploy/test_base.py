@@ -8,11 +8,13 @@ import pytest
 from PIL import Image
 
 import mvitac
+from mvitac.cli.evaluate import _ProbeOptions
 from mvitac.cli.main import main
+from mvitac.cli.options import parse
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.deploy.publish import own_data
 from mvitac.evaluation.leaks import read_sources
-from mvitac.shipped import BASE, named, with_names
+from mvitac.shipped import BASE, named
 from mvitac.training.start import read_start
 from support.toy import toy_pack
 
@@ -31,8 +33,8 @@ def test_base_answers_offline_by_its_name(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_commands_know_base(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    words = ["base", "--model", "base", "--name", "base", "--init", "base"]
-    assert with_names(words) == [str(BASE), "--model", str(BASE), *words[3:]]
+    found = parse(_ProbeOptions, ["base", "--tasks", "feel", "base"], "probe")
+    assert found.runs == (BASE,) and found.config.tasks == ("feel", "base")
     run = replace(mvitac.recipe("locked"), init=mvitac.Init(path=Path("base")))
     start = read_start(run.init)
     assert start is not None and set(start.trunks) == {"vision", "touch"}

@@ -36,12 +36,8 @@ class Felt(Grasps):
         held = int(rng.random() < 0.5)
         vision, touch = rng.integers(0, 256, (16, 16, 3)), rng.integers(0, 60, (16, 16, 6)) + 120 * held
         split = ("train", "test", "val", "train")[thing % 4]
-        columns = {
-            "id": f"{thing}-{index}",
-            "group": f"thing {thing}",
-            "touch_group": f"{thing}-{index}",
-            "split": split,
-        }
+        name = f"{thing}-{index}"
+        columns = {"id": name, "group": f"thing {thing}", "touch_group": name, "split": split}
         columns |= {"label_success": held, "phase": "during", "contact_left": rng.random(), "contact_right": 0.0}
         return [Sample(vision=vision.astype(np.uint8), touch=touch.astype(np.uint8), columns=columns)]
 

@@ -72,7 +72,7 @@ def features_that_know(pack: Pack, task_index: int, how_well: float = 3.0) -> np
 @pytest.mark.parametrize("task_index", [0, 1])
 def test_finds_what_is_there(pack: Pack, kind: str, task_index: int) -> None:
     task = pack.spec.tasks[task_index]
-    found = probe_features(features_that_know(pack, task_index), pack, task, split_rows(pack, task), kind, 0)
+    found = probe_features(features_that_know(pack, task_index), pack, task, split_rows(pack, task), kind, 0)[0]
     assert found["accuracy"] == 1.0
     assert found["balanced_accuracy"] == 1.0
     assert found["macro_f1"] == 1.0
@@ -94,7 +94,7 @@ def test_the_papers_probe_learns_and_repeats() -> None:
 def test_linear_equals_scikit_learn(pack: Pack) -> None:
     task = pack.spec.tasks[0]
     rows, x = split_rows(pack, task), features_that_know(pack, 0, how_well=0.4)
-    found = probe_features(x, pack, task, rows, "linear", 0)
+    found = probe_features(x, pack, task, rows, "linear", 0)[0]
     labels = pack.column("label_pattern")
     num_train, num_both = len(rows.train), len(rows.train) + len(rows.val)
     mean, std = x[:num_train].mean(0), x[:num_train].std(0)
@@ -108,7 +108,7 @@ def test_nothing_is_chosen_on_test(pack: Pack, monkeypatch: pytest.MonkeyPatch) 
     """Shuffling the test labels changes the score but not the regularisation nor the predictions."""
     task = pack.spec.tasks[0]
     rows, x = split_rows(pack, task), features_that_know(pack, 0, how_well=0.6)
-    before = probe_features(x, pack, task, rows, "linear", 0)
+    before = probe_features(x, pack, task, rows, "linear", 0)[0]
     real = Pack.labels
 
     def shuffled(self: Pack, task: str, *splits: str) -> np.ndarray:
@@ -117,7 +117,7 @@ def test_nothing_is_chosen_on_test(pack: Pack, monkeypatch: pytest.MonkeyPatch) 
         return values
 
     monkeypatch.setattr(Pack, "labels", shuffled)
-    after = probe_features(x, pack, task, rows, "linear", 0)
+    after = probe_features(x, pack, task, rows, "linear", 0)[0]
     assert after["C"] == before["C"]
     assert np.array_equal(np.roll(before["confusion"], 1, axis=0), after["confusion"])
 
@@ -152,11 +152,8 @@ def test_every_score_has_its_controls(result: dict) -> None:
     for task, summary in result["summary"].items():
         assert all(textwrap.fill(line, 80, subsequent_indent="  ") in text for line in verdicts(summary))
         for one in result["per_class"][task]["both"]:
-            cells = [
-                "-" if v is None else f"{100 * v:.1f}"
-                for s in ("mvitac", "untrained", "pixels")
-                for v in one["scores"][s]
-            ]
+            scores = [score for source in ("mvitac", "untrained", "pixels") for score in one["scores"][source]]
+            cells = ["-" if score is None else f"{100 * score:.1f}" for score in scores]
             row = [one["class"], str(one["rows"]), str(one["groups"]), *cells]
             assert row in [line.replace(" / ", " ").split() for line in text.splitlines()]
     assert max(map(len, text.splitlines())) <= 80
@@ -304,7 +301,7 @@ def test_tasks_of_one_run_are_probed_together(pack: Pack) -> None:
 
     records = probe_all(matrix, pack, tasks, ["touch"], ["paper"], 3)
     for task, record in zip(tasks, records, strict=True):
-        alone = probe_features(x, pack, task, split_rows(pack, task), "paper", 3)
+        alone = probe_features(x, pack, task, split_rows(pack, task), "paper", 3)[0]
         assert record["accuracy"] == alone["accuracy"] and record["confusion"] == alone["confusion"]
 
 

@@ -15,7 +15,6 @@ from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack, MixedPack
 from mvitac.data.source import Sample
 from mvitac.datasets.pack import PackConfig
-from mvitac.evaluation import features as features_module
 from mvitac.evaluation import sensors as module
 from mvitac.evaluation.features import features
 from mvitac.evaluation.sensors import (
@@ -117,21 +116,6 @@ def test_joined_packs_take_statistics_from_hidden_rows(pack: Pack, others: Pack)
     new, old = (unlabelled_rows(both, number) for number in (0, 1))
     assert (new >= pack.num).all() and set(both.column("split")[new]) == {"hidden"}
     assert (old < pack.num).all() and set(both.column("split")[old]) == {"train"}
-
-
-def test_a_joined_pack_reads_only_images_that_no_probe_has_read(
-    model: Model, pack: Pack, others: Pack, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("MVITAC_CACHE", str(tmp_path))
-    both, rows, read = JoinedPack(pack, others), np.arange(3, 2 * pack.num, 2)[::-1], []
-    expected = features(model, both, "touch", rows)
-    features(model, pack, "touch", np.arange(pack.num))
-    counted = features_module.pack_features
-    monkeypatch.setattr(features_module, "pack_features", lambda *a, **k: (read.append(len(a[3])), counted(*a, **k))[1])
-    for asked in (rows, rows[rows < pack.num]):
-        found = features(model, both, "touch", np.sort(asked))
-        np.testing.assert_allclose(found[::-1], expected[-len(asked) :], rtol=1e-4, atol=1e-5)
-    assert read == [pack.num // 2]
 
 
 def test_features_are_standardised_by_each_sensors_own_images(model: Model, others: Pack) -> None:

@@ -334,6 +334,17 @@ def test_the_simulated_sensor_is_calibrated_while_free() -> None:
     assert found == [None] * 29 + [False] + [True] * 20 + [False] * 10
 
 
+@pytest.mark.parametrize("given", [False, True])
+def test_a_press_that_changes_colours_alone_begins_and_ends(given: bool) -> None:
+    """Also against one noisy image without contact: its own noise once kept the touch from ending."""
+    rng, rest = np.random.default_rng(0), np.array([90.0, 120, 100])
+    press = np.array([130.0, 99.6, 100])  # as bright
+    frames = [(rest if i < 40 else press if i < 60 else rest) + rng.normal(0, 2, (48, 48, 3)) for i in range(90)]
+    images = [image.astype(np.uint8) for image in frames]
+    contact = Contact(LiveConfig(), free=images[0] if given else None)
+    assert [bool(contact(image)) for image in images[1:]] == [False] * 39 + [True] * 20 + [False] * 30
+
+
 def test_a_recording_is_a_pack(engine: Engine, tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "pack", fps=5.0)  # also of a sensor that is faster
     kept: list[Any] = []

@@ -161,6 +161,7 @@ WRONG: dict[str, tuple[Callable[[State], dict[str, Any]], str]] = {
     "two": (lambda w: behind("encoder.", w) | behind("backbone.", w), "two sets of weights fit, below 'encoder.' and"),
     "quantised": (lambda w: w | {"bn1.weight": w["bn1.weight"].to(torch.int8)}, r"1 tensor \(bn1\.weight\) of whole"),
     "without numbers": (lambda w: w | {"bn1.weight": w["bn1.weight"].to("meta")}, r"1 tensor \(bn1\.weight\) missing"),
+    "zeros": (lambda w: {name: 0 * value for name, value in w.items()}, "weights that are all 0"),
     "nan": (lambda w: w | {"bn1.weight": w["bn1.weight"] * torch.nan}, r"NaN or infinite numbers: 1 tensor \(bn1"),
 }
 

@@ -89,6 +89,14 @@ def test_killed_and_resumed_keeps_the_same_best_weights_and_sentence(pack: Pack,
     assert first == second
 
 
+def test_a_run_that_began_without_validation_is_resumed_with_it(pack: Pack, tmp_path: Path) -> None:
+    settings = smoke(pack, checkpoint_every=2)
+    with power_cut(5), pytest.raises(RuntimeError, match="power cut"):
+        train(settings, tmp_path, quiet=True, validate=False)
+    train(settings, tmp_path, resume=True, quiet=True)
+    assert "eval" in log_of(tmp_path)[-1] and "verdict" not in log_of(tmp_path)[-1]
+
+
 def cell(wrong: list[int], rows: int = 10) -> torch.Tensor:
     return torch.tensor([[[w, rows] for w in wrong]], dtype=torch.float64)
 
@@ -106,15 +114,16 @@ def test_what_rose_and_what_fell_is_told_by_a_paired_t_interval_over_groups() ->
         low, high = ttest_rel(*rates).confidence_interval(0.95)
         gain = 100 * (rates[0] - rates[1]).mean()
         texts[name] = f"touch/{name} {gain:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"
-    assert said.endswith(f"on objects of val), rose: {texts['a']}; fell: {texts['c']}; neither: {texts['b']}")
-    assert verdict({}, {}, "object").startswith("no labels of two classes, and no values, in split val")
+    assert said[0].endswith(f"on objects of val), rose: {texts['a']}")
+    assert said[1:] == [f"fell: {texts['c']}", f"neither: {texts['b']}"]
+    assert verdict({}, {}, "object")[0].startswith("split val has no labels of two classes, and no values")
 
 
 @pytest.mark.parametrize("num", [1, 9])
 def test_few_groups_of_val_tell_nothing(num: int) -> None:
     """R2 -135 to -1 on three videos was "level: -28.6 points [-348.9, +291.8]"."""
     start, end = ({"touch/linear force": torch.tensor([[[e, 1.0]] * num])} for e in (136.0, 2.0))
-    said = verdict(start, end, "video")
+    (said,) = verdict(start, end, "video")
     assert said.endswith("cannot tell with under 10 videos: touch/force +13400.0")
     assert "rose" not in said and "neither" not in said
 

@@ -243,9 +243,8 @@ def _glance(board: Board) -> Figure:
     """All scores as one picture. The shade of a column goes from its untrained row, or its lowest, to its best score."""
     names, rows = [*board.encoders, *board.controls[::-1]], board.rows
     scores = np.array([[row.cells[n]["mean"] if n in row.cells else np.nan for row in rows] for n in names])
-    least = [
-        row.cells.get("untrained", {"mean": low})["mean"] for row, low in zip(rows, np.nanmin(scores, 0), strict=True)
-    ]
+    lowest = zip(rows, np.nanmin(scores, 0), strict=True)
+    least = [row.cells.get("untrained", {"mean": low})["mean"] for row, low in lowest]
     shades = np.clip((scores - least) / np.maximum(np.nanmax(scores, 0) - least, 1e-9), 0, 1)
     figure, axes = new_figure("", 2.2 + 0.3 * len(names), 3 + 0.6 * len(rows))
     axes.imshow(shades, cmap=LinearSegmentedColormap.from_list("", ["white", COLOURS["blue"]]), aspect="auto", vmax=1.6)

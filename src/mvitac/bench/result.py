@@ -152,7 +152,10 @@ def problems(value: dict[str, Any]) -> list[str]:
     trunks = {any(r["source"] == "imagenet" for r in b["records"]) for b in value["blocks"] if "records" in b}
     if len(trunks) != 1:
         found.append("has the control imagenet in some tasks only" if trunks else "was run on no task")
+    data: dict[str, Any] = {}
     for block, (one, ask) in zip(value["blocks"], asked, strict=True):
+        if data.setdefault(one.name, block.get("data")) != (block.get("data") or data[one.name]):
+            found.append(f"{one.name}, {ask.name}: its data is not that of the set's other tasks")
         found += [f"{one.name}, {ask.name}: {text}" for text in _excuses(block, encoder)]
         if "not_run" not in block:
             found += [f"{one.name}, {ask.name}: {text}" for text in _of_block(block, suite, one, ask, encoder)]
@@ -173,6 +176,9 @@ def problems_of(encoder: dict[str, Any], controls: Sequence[str]) -> Iterator[st
     seeds, weights = encoder["seeds"], encoder["weights"]
     numbers = {"images_seen": encoder["images_seen"] or 0, "size": encoder["size"], **encoder["parameters"]}
     yield from (f"{key} is {number}" for key, number in numbers.items() if not 0 <= number < 1e18)
+    yield from (
+        f"{key} is no text" for key in ("licence", "trained_on") if not isinstance(encoder.get(key, ""), str | None)
+    )
     if not len(seeds) == len(set(seeds)) == len(set(weights)) == len(weights):
         yield f"has {len(set(weights))} weights for seeds {seeds}"
 

@@ -91,14 +91,11 @@ class Reader:
         return list(self.bound[0].notes) if isinstance(self.bound[0], ExternalModel) else []
 
     def read(self, modality: str, rows: np.ndarray) -> np.ndarray:
-        """Features [len(rows), D]."""
-        parts = []
-        for m in names_in(modality, self.opened.packs[0]):
-            if m not in self.known:
-                self.known[m] = self._all(m)
-            own, z = self.known[m]
-            parts.append(z[np.searchsorted(own, rows)])
-        return np.concatenate(parts, axis=1)
+        """Features [len(rows), D] of touch or vision."""
+        if modality not in self.known:
+            self.known[modality] = self._all(modality)
+        own, z = self.known[modality]
+        return z[np.searchsorted(own, rows)]
 
     def _all(self, modality: str) -> tuple[np.ndarray, np.ndarray]:
         """All rows of a modality that are needed, and their features; ValueError if these are no finite numbers."""

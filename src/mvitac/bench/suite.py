@@ -219,9 +219,8 @@ def _fold(pack: Pack, one: SuiteSet) -> tuple[Pack, ...]:
     strata = [_stratum(pack, tasks[one.tasks[0].name], groups == group) for group in kept]
     columns = folds(kept, strata, one.folds, one.val_every)
     sides = [dict(zip(kept, column, strict=True)) for column in columns.values()]
-    return tuple(
-        pack.with_splits({"split": [side.get(group, "unlabelled") for group in groups.tolist()]}) for side in sides
-    )
+    splits = ([side.get(group, "unlabelled") for group in groups.tolist()] for side in sides)
+    return tuple(pack.with_splits({"split": split}) for split in splits)
 
 
 def _stratum(pack: Pack, task: AnyTask, rows: np.ndarray) -> str:

@@ -3,6 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 from typing import Annotated, Any
 
 import numpy as np
@@ -56,16 +57,19 @@ def pack(argv: list[str]) -> None:
         print(f'{len(lost)} left out, listed under "damaged" in {pack.path / "pack.json"}; first {first}')
     print(_groups(pack))
     for note in pack.spec.notes:
-        print(f"note: {note}")
+        print(fill(f"note: {note}", 80))
 
 
 def _groups(pack: Pack) -> str:
     """What a group of the pack is and what that does to splits and intervals."""
     sizes = Counter(pack.column("group").tolist()).values()
     rows = " to ".join(map(str, dict.fromkeys((min(sizes), max(sizes)))))
-    about = f"groups: {len(sizes)}, one per {pack.spec.group_by}, of {rows} row{'s' * (rows != '1')} each"
+    about = f"groups: {len(sizes)}, one per {pack.spec.group_by}, of {rows} row{'s' * (rows != '1')} each. "
+    if max(sizes) > 1 and len(np.unique(pack.touch_groups)) == len(sizes):
+        about += "Each is one touch group, too: rows of it may be positives (--touch-group names presses). "
     leaks = "; ".join(pack.split_leaks(pack.spec.all_tasks).values())
-    return f"{about}. " + (f"LEAK: {leaks}." if leaks else "A split takes whole groups, and intervals resample them.")
+    about += f"LEAK: {leaks}." if leaks else "A split takes whole groups, and intervals are over them."
+    return fill(about, 80)
 
 
 @dataclass(frozen=True)

@@ -54,8 +54,10 @@ class _SourceOptions(_Options):
 def check(argv: list[str]) -> int:
     """mvitac data check PACK [PACK ...] | --data NAME ... [--json FILE] [--sheet FILE.png]"""
     chosen, rest = selectors(argv, ("--data",))
-    if "--data" not in chosen and rest and (path := Path(rest[0])).exists() and not (path / "pack.json").exists():
-        chosen["--data"] = rest.pop(0)  # a table, a video or a folder
+    paths = [w for b, w in zip(["", *rest], rest, strict=False) if b[:2] != "--" and Path(w).exists()]
+    if "--data" not in chosen and paths and not (Path(paths[0]) / "pack.json").exists():
+        chosen["--data"] = paths[0]  # a table, a video or a folder
+        rest.remove(paths[0])
     if "--data" not in chosen:
         options = parse(_PackOptions, rest, "data check", description=_MANUAL)
         name = " + ".join(options.pack)

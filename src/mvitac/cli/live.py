@@ -170,11 +170,12 @@ def predict(argv: list[str]) -> None:
     given = {"vision": (options.vision,) if options.vision else (), "touch": options.touch}
     opened = {m: [recording(text) for text in texts] for m, texts in given.items() if texts and files}
     single = [recording(options.source)] if options.source and files else []
+    config: Any = None if files else dataset(options.source or "")  # what cannot be read is refused before an export
     engine = _engine(options.model, options.threads, tuple(opened), most=1 if single else 2)
     if not (engine.classes or engine.values):
         raise ValueError(f"{options.model} has no probes of classes or values: export it on data that has labels")
-    if options.source and not files:
-        pack = _opened(options.source, given, next(iter(engine.inputs.values()))[0])
+    if config:
+        pack = _opened(config, given, next(iter(engine.inputs.values()))[0])
         _write(options.out, pack_tables(engine, pack), pack.num)
         return
     opened = dict.fromkeys(engine.inputs, single) if single else opened
@@ -187,9 +188,8 @@ def predict(argv: list[str]) -> None:
         _say(f"contact is not known: no {options.live.calibration} frames without it, and no --background")
 
 
-def _opened(source: str, names: Mapping[str, Sequence[str]], side: int) -> Pack:
-    """Any data, every image of it, at ``side`` px; ``names`` are those of its images by modality, where it has names."""
-    config: Any = dataset(source)
+def _opened(config: Any, names: Mapping[str, Sequence[str]], side: int) -> Pack:
+    """Every image of ``config`` at ``side`` px; ``names`` are those of its images by modality, where it has names."""
     if isinstance(config, PackConfig):
         return config.open()
     given: dict[str, Any] = {"vision": names["vision"][0] if names["vision"] else None, "touch": names["touch"] or None}

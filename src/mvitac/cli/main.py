@@ -13,7 +13,6 @@ from pathlib import Path
 
 from mvitac import __version__
 from mvitac.registry import unknown
-from mvitac.shipped import with_names
 
 HELP = (Path(__file__).parent / "help.txt").read_text(encoding="utf-8")
 
@@ -103,7 +102,7 @@ def _run(arguments: list[str]) -> int:
 
             loading()
     module, function = COMMANDS[name].split(":")
-    return getattr(importlib.import_module(f"mvitac.cli.{module}"), function)(with_names(rest)) or 0
+    return getattr(importlib.import_module(f"mvitac.cli.{module}"), function)(rest) or 0
 
 
 def _check_choices(rest: Sequence[str], text: Path) -> None:

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import dataclasses
 import inspect
 import io
 import itertools
@@ -17,6 +18,7 @@ from unittest.mock import patch
 
 import tyro
 
+from mvitac.shipped import named
 from mvitac.system.files import check_place, write_json
 
 T = TypeVar("T")
@@ -45,7 +47,7 @@ def parse(
                 with _joined_lines(), contextlib.redirect_stdout(shown):
                     tyro.cli(kind, **options, config=(tyro.conf.FlagCreatePairsOff, tyro.conf.SuppressFixed))  # type: ignore[arg-type]
             with patch.dict(os.environ, COLUMNS="10000"):  # the lines of an error must not be wrapped
-                return tyro.cli(kind, **options)  # type: ignore[arg-type]
+                return _with_base(tyro.cli(kind, **options))  # type: ignore[arg-type]
     except SystemExit as exit_:
         if not exit_.code:  # what has no default, or may be left out, need not be said
             text = re.sub(r"\{None\}\|(\S+ )( +\S)", r"\1       \2", shown.getvalue())
@@ -54,6 +56,13 @@ def parse(
                 print(line if line[:1] == " " else textwrap.fill(line, 80))
             raise
         raise ValueError(_one_line(boxed.getvalue(), prog)) from None
+
+
+def _with_base(options: T) -> T:
+    """``options`` with the folder of the shipped model where a model is called ``base``."""
+    given = {name: value for name in ("model", "models", "run", "runs") if (value := getattr(options, name, None))}
+    found = {n: tuple(map(named, v)) if isinstance(v, tuple) else named(v) for n, v in given.items()}
+    return dataclasses.replace(options, **found)  # type: ignore[type-var]
 
 
 def _for_both(argv: Sequence[str]) -> list[str]:

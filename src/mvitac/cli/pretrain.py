@@ -35,7 +35,7 @@ def pretrain(argv: list[str]) -> None:
     if not asks_help(rest) and not {"--data", "--from"} & chosen.keys():
         names = "|".join(DatasetConfig.choices)
         raise ValueError(f"name the data: --data {names}, a path, or --from RUN.JSON; without any: mvitac demo")
-    description = f"""Pre-train encoders without labels.
+    description = f"""Pre-train encoders, by a method without labels or a supervised one.
 
     First choose, then change single fields below (defaults are those of the chosen recipe):
       --recipe {"|".join(RECIPES)}  (default quick)

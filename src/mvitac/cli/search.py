@@ -110,9 +110,7 @@ def find(argv: list[str]) -> None:
         }
         for row, cosine in zip(rows[0].tolist(), cosines[0], strict=True)
     ]
-    lines = [
-        [f"{o['cosine']:.3f}", o["id"], o["group"], *(o["labels"].get(t, "") for t in known.classes)] for o in found
-    ]
+    lines = [[f"{o['cosine']:.3f}", o["id"], o["group"], *map(o["labels"].get, known.classes)] for o in found]
     table = tabulate(lines, ["cosine", "id", "group", *known.classes], disable_numparse=True)
     title = f"{options.source} -> {target} in {options.known}"
     print(title, table, "", sep="\n", file=printed_to(options.json))

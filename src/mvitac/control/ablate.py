@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,7 @@ class Episodes:
     actions: np.ndarray | None = None  # demonstrated, [N, T], episode after episode
     touched: np.ndarray | None = None  # bool [N]
     unit: str = "standard deviations of the action"  # of the error
+    of: str = ""  # which ones of the data they are
 
 
 class Recorded:
@@ -81,7 +83,7 @@ class Recorded:
 
 
 def read_episodes(pack: Pack) -> Episodes:
-    """The episodes of ``pack``, its groups; ValueError if it has no task of values "action", no touch or one episode."""
+    """Episodes are the groups of ``pack``, of split test if it has two. ValueError without touch, action or two."""
     values = {task.name: pack.values(task) for task in pack.spec.values}
     if "action" not in values or "touch" not in pack.spec.modalities:
         raise ValueError(f"{pack.path} has no touch, or no values named action: pack with --values action=a:mm,b:deg")
@@ -94,11 +96,13 @@ def read_episodes(pack: Pack) -> Episodes:
     which = np.unique(pack.column("group").astype(str), return_inverse=True)[1]
     by = np.lexsort((places(pack, pack.spec.window)[1], which))
     rows = np.split(by, np.cumsum(np.bincount(which))[:-1])
+    unseen = [each for each in rows if (pack.column("split")[each] == "test").all()]
+    of, rows = (" of split test", unseen) if len(unseen) > 1 else ("", rows)
     if len(rows) < 2:
         raise ValueError(f"{pack.path} has one episode: episodes are its groups, give at least two")
-    actions = values.pop("action")[by]
+    actions = values.pop("action")[np.concatenate(rows)]
     begin = [partial(Recorded, pack, each, values) for each in rows]
-    return Episodes(begin, begin[0]().senses, pack.images, rows, actions, _touched(pack, rows))
+    return Episodes(begin, begin[0]().senses, pack.images, rows, actions, _touched(pack, rows), of=of)
 
 
 def _touched(pack: Pack, rows: Sequence[np.ndarray]) -> np.ndarray:
@@ -137,9 +141,12 @@ def open_policy(text: str) -> Policy:
     if not file.endswith(".py"):
         raise ValueError(f"{text!r} is no policy: give FILE.py:function or a LeRobot policy's folder")
     try:
-        return runpy.run_path(file)[name]
+        found = runpy.run_path(file)
     except (Exception, SystemExit) as error:  # whatever the owner's code raises
         raise ValueError(f"{text} cannot be imported ({type(error).__name__}: {brief(error)})") from None
+    if not callable(found.get(name)):
+        raise ValueError(f"{file} has no function {name!r}")
+    return found[name]
 
 
 def lerobot_policy(folder: Path) -> Policy:
@@ -248,12 +255,17 @@ def ablate(policy: Policy, episodes: Episodes) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     with work("acting", 1 + len(episodes.senses) * len(KINDS), "times") as advance:
         normal, own, steps = act(policy, episodes, watch=None if episodes.images else keep)
+        again, *_ = act(policy, episodes)
         advance()
         if not episodes.images:
             episodes.images, episodes.rows = {sense: np.stack(images) for sense, images in seen.items()}, steps
         wanted = normal if episodes.actions is None else episodes.actions
         still = np.nanmax(wanted, axis=0) == np.nanmin(wanted, axis=0)
         scale = np.where(still, np.inf, np.nanstd(wanted, axis=0))
+        if again.shape != normal.shape or away(again, normal, scale).max() > SMALL:
+            raise ValueError(
+                "the policy acts differently on the same episodes: give it reset(), and seed what it draws"
+            )
         kept = [each[np.isfinite(wanted[each]).all(1)] for each in steps]
         parts = _parts(episodes.touched, kept)
         if episodes.actions is not None:
@@ -266,7 +278,7 @@ def ablate(policy: Policy, episodes: Episodes) -> dict[str, Any]:
             paired = {"change": _paired(away(changed, normal, scale), kept), "error": _paired(worse, kept), "parts": of}
             rows.append({"sense": sense, "kind": kind, **paired})
     found = {sense: verdict(sense, [row for row in rows if row["sense"] == sense]) for sense in episodes.senses}
-    about = {"episodes": len(kept), "unit": episodes.unit, "error": _paired(own, kept)[:3]}
+    about = {"episodes": len(kept), "of": episodes.of, "unit": episodes.unit, "error": _paired(own, kept)[:3]}
     return {**about, "rows": rows, "verdicts": found}
 
 
@@ -295,7 +307,7 @@ def verdict(sense: str, rows: Sequence[Mapping[str, Any]]) -> str:
     for row in rows:
         mean, p = row["error"][0], row["error"][3] * len(PLAUSIBLE)
         if row["kind"] in PLAUSIBLE and mean > 0 and p < 0.05:
-            size = f"by {mean:.2g} with it replaced by {row['kind']} (p {p:.2g})"
+            size = f"by {mean:.2g} with it replaced by {row['kind']} (corrected p {p:.2g})"
             return f"The policy uses {sense}: its error grows {size}."
     if max(row["change"][2] for row in rows) < SMALL:
         return f"The policy does not use {sense}: no replacement changes its action by {SMALL} standard deviations."
@@ -306,9 +318,9 @@ def report(result: Mapping[str, Any]) -> str:
     """The result as text."""
     rows, text = result["rows"], "{0:.2f} [{1:.2f}, {2:.2f}]".format
     lines = [[r["sense"], r["kind"], text(*r["change"]), text(*r["error"]), f"{r['error'][3]:.2g}"] for r in rows]
-    about = [f"{result['episodes']} episodes, error {text(*result['error'])}, in {result['unit']}"]
+    about = [f"{result['episodes']} episodes{result['of']}, error {text(*result['error'])}, in {result['unit']}"]
     about += [tabulate(lines, ["replaced", "by", "change of action", "change of error", "p"], disable_numparse=True)]
     if of := [*rows[0]["parts"]]:
         parts = [[r["sense"], r["kind"], *(f"{v[0]:+.2f}" for v in r["parts"].values())] for r in rows]
         about += ["Change of error in parts:", tabulate(parts, ["replaced", "by", *of], disable_numparse=True)]
-    return "\n".join([*about, *result["verdicts"].values()])
+    return "\n".join([*about, *(fill(text, 80) for text in result["verdicts"].values())])

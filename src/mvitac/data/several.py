@@ -68,10 +68,9 @@ class MixedPack(_Several):
         self.path, self.meta = Path(" + ".join(str(pack.path) for pack in packs)), {}
         self.size = size or max(pack.size for pack in packs)
         self.digests = {name: pack.digest for name, pack in parts.items()} | {"size": digest(self.size)}
+        other = {name: pack.size for name, pack in parts.items() if pack.size != self.size}
         notes = [
-            f"{name}: images of {pack.size} px are resized to {self.size} px when they are read"
-            for name, pack in parts.items()
-            if pack.size != self.size
+            f"{name}: images of {px} px are resized to {self.size} px as they are read" for name, px in other.items()
         ]
         if found := _shared_by_parts(parts):
             if not allow_leak:

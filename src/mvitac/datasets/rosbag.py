@@ -47,15 +47,8 @@ class RosbagConfig(RecordedConfig):
 
     def manifest(self) -> Manifest:
         cameras = [topic for topic in (*self.touch, self.vision) if topic]
-        named = (
-            *self.labels,
-            *self.numbers(),
-            *self.conditioned(),
-            self.group,
-            self.touch_group,
-            self.split,
-            self.sensor,
-        )
+        named = *self.labels, *self.numbers(), *self.conditioned()
+        named = *named, self.group, self.touch_group, self.split, self.sensor
         smooth, every = self.numbers() if self.interpolate == "linear" else (), self.every or 1
         rows: list[Row] = []
         images: dict[str, list[ImageRef | None]] = {topic: [] for topic in cameras}
@@ -123,9 +116,8 @@ def _read(bag: Path, cameras: Sequence[str], asked: Sequence[str]) -> dict[str, 
             if topic not in topics:
                 raise ValueError(f"{bag}: {unknown('topic', topic, topics)}")
         fields = {t: [name for name in asked if name.startswith(f"{t}.")] for t in sorted(topics) if t not in cameras}
-        found: dict[str, list[tuple[float, Any]]] = {
-            topic: [] for topic in (*cameras, *(t for t in fields if fields[t]))
-        }
+        used = [*cameras, *(topic for topic in fields if fields[topic])]
+        found: dict[str, list[tuple[float, Any]]] = {topic: [] for topic in used}
         asked_for = [c for c in reader.connections if c.topic in found]
         for connection, place, raw in _placed(reader.messages(asked_for)):
             received = place[0]

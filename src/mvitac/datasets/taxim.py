@@ -80,9 +80,8 @@ class Taxim(Source):
     def read(self, item: int) -> list[Sample]:
         config = self.config
         if config.num:
-            made = ball.press_ball(
-                config.seed, item, size=config.size, sensors=config.choice(), background=config.difference
-            )
+            look: Any = {"size": config.size, "sensors": config.choice(), "background": config.difference}
+            made = ball.press_ball(config.seed, item, **look)
             group, split = f"{item:05d}", ("test", "val", *["train"] * 8)[item % 10]
         else:
             made, split = _frame(*self._frames()[item]), "test"

@@ -65,10 +65,7 @@ def _tables(model: Model, scores: dict[str, Any]) -> list[str]:
         probes = [probe.info for probe in model.probes.values() if probe.info.task == name]
         if infos := [info for info in probes if isinstance(info, ValueInfo)]:
             errors = [[f"{e.mae:.3g} ({e.rmse:.3g})" for e in info.errors] for info in infos]
-            rows = [
-                [target.name, *(f"{each[t]} {target.unit}" for each in errors)]
-                for t, target in enumerate(infos[0].targets)
-            ]
+            rows = [[t.name, *(f"{e[i]} {t.unit}" for e in errors)] for i, t in enumerate(infos[0].targets)]
             heads = ["mean absolute error (root mean square)", *(info.modality for info in infos)]
             lines += pipes(heads, rows, words=1)
     return lines

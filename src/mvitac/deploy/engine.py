@@ -193,11 +193,8 @@ def _openvino(path: Path, precision: str, threads: int) -> Call:
 
     core = openvino.Core()
     bf16 = precision == "bf16" and "BF16" in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
-    config = {
-        "PERFORMANCE_HINT": "LATENCY",
-        "INFERENCE_NUM_THREADS": threads,
-        "INFERENCE_PRECISION_HINT": "bf16" if bf16 else "f32",
-    }
+    config: dict[str, Any] = {"PERFORMANCE_HINT": "LATENCY", "INFERENCE_NUM_THREADS": threads}
+    config["INFERENCE_PRECISION_HINT"] = "bf16" if bf16 else "f32"
     model = core.compile_model(path, "CPU", config)
     names, request = [port.any_name for port in model.inputs], model.create_infer_request()
 

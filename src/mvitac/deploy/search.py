@@ -37,13 +37,9 @@ def embed(model: Model, pack: Pack, file: Path, *, shared: bool = False) -> pa.T
         whole = np.full((len(rows), x.shape[1]), np.nan, np.float32)
         whole[have] = x
         table = table.append_column(modality, pa.FixedSizeListArray.from_arrays(whole.reshape(-1), x.shape[1]))
-    about = {
-        "weights": model.weights_digest(),
-        "shared": shared,
-        "pack": str(pack.path),
-        "pack_digest": pack.digest,
-        "classes": {task.name: list(task.classes) for task in pack.spec.tasks},
-    }
+    classes = {task.name: list(task.classes) for task in pack.spec.tasks}
+    about = {"weights": model.weights_digest(), "shared": shared, "classes": classes}
+    about |= {"pack": str(pack.path), "pack_digest": pack.digest}
     table = table.replace_schema_metadata({ABOUT: json.dumps(about)})
     write_atomic(file, lambda out: pq.write_table(table, out, write_page_checksum=True))
     return table

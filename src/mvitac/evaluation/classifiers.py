@@ -4,7 +4,8 @@ Shapes: features [N, D]. A fitted classifier is a function from features to clas
 """
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 
@@ -21,13 +22,20 @@ Classifier = Callable[[np.ndarray], np.ndarray]
 UNSEEN = -1e4  # logit of a class without training examples: probability 0 in fp32, and still finite in fp16
 STRENGTHS = (0.001, 0.01, 0.1, 1.0)  # candidate values of C, the inverse regularisation strength of logistic regression
 NEIGHBOURS = 20
+_THREADPOOLS = cache(ThreadpoolController)  # finding them takes 5 ms, a tenth of a small probe's time
 EPOCHS, BATCH, DROPOUT = 60, 256, 0.2  # training settings of the paper's probe (appendix A)
 
 
-@cache
-def threadpools() -> ThreadpoolController:
-    """The thread pools of BLAS and OpenMP. Finding them takes 5 ms, a tenth of a small probe's time."""
-    return ThreadpoolController()
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Fit with one thread of BLAS and OpenMP, without scikit-learn's warnings that 300 steps are few: they choose C.
+
+    The products are small, and waiting threads made logistic regression ten times slower. Several fits may run at once in
+    threads. Both settings are the process's, so whoever starts the threads enters this first.
+    """
+    with warnings.catch_warnings(), _THREADPOOLS().limit(limits=1):
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        yield
 
 
 @dataclass(frozen=True)
@@ -84,9 +92,7 @@ def fit_linear(
     x, x_val = (x - mean) / std, (x_val - mean) / std
     # C ascends and each fit starts from the last one: about a third of the steps of cold starts.
     model = LogisticRegression(max_iter=300, tol=1e-3, warm_start=True)
-    # One BLAS thread: the products are small, and waiting threads made this ten times slower.
-    with warnings.catch_warnings(), threadpools().limit(limits=1):
-        warnings.simplefilter("ignore", ConvergenceWarning)  # 300 L-BFGS steps are enough to choose C
+    with one_blas_thread():
         scores = [model.set_params(C=c).fit(x, y).score(x_val, y_val) for c in STRENGTHS]
         c = STRENGTHS[int(np.argmax(scores))]
         if set(y_val) - set(y):  # a class seen only in val changes the shape of the weights

@@ -5,6 +5,7 @@ Controls are the most common class, raw pixels, the image border, the dataset's 
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -42,8 +43,11 @@ Records = list[dict[str, Any]]
 
 def thumbnails(pack: Pack, modality: str, rows: np.ndarray, side: int = 8) -> np.ndarray:
     """Control "pixels": the image averaged to side x side and flattened, [len(rows), side * side * C]."""
-    images = torch.from_numpy(pack.images[modality][rows]).permute(0, 3, 1, 2).float() / 255
-    return F.adaptive_avg_pool2d(images, side).flatten(1).numpy()
+    means = []
+    for chunk in np.array_split(rows, len(rows) // 64 + 1):  # as floats, all images may be larger than memory
+        images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).float() / 255
+        means.append(F.adaptive_avg_pool2d(images, side).flatten(1))
+    return torch.cat(means).numpy()
 
 
 def borders(pack: Pack, modality: str, rows: np.ndarray, side: int = 16, width: int = 2) -> np.ndarray:
@@ -110,14 +114,12 @@ def label_controls(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[st
             answer = np.eye(len(task.classes))[np.bincount(pack.labels(task.name)[rows.fitted]).argmax()]
         else:
             answer = np.nanmean(pack.values(task)[rows.fitted], axis=0)
-        scores = score_rows(pack, task, rows.test, np.tile(answer, (len(rows.test), 1)))
-        found = {"majority" if isinstance(task, Task) else "mean": scores}
+        guess, kind = ("majority", "linear") if isinstance(task, Task) else ("mean", "curve")
+        found = {guess: score_rows(pack, task, rows.test, np.tile(answer, (len(rows.test), 1)))}
         for name, columns in pack.spec.controls.items():
             x = np.stack([pack.column(column).astype(float) for column in columns], axis=1)
             if np.isfinite(x[whole]).all():  # else rows of a part of a mix that has no such control
-                found[name] = probe_features(
-                    x[rows.all], pack, task, rows, "linear" if isinstance(task, Task) else "curve", 0
-                )
+                found[name], _ = probe_features(x[rows.all], pack, task, rows, kind, 0)
         for name, result in found.items():
             records += _named(name, None, [{"task": task.name, "modality": modality, "probe": "linear", **result}])
     return records
@@ -125,13 +127,10 @@ def label_controls(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[st
 
 def pixel_controls(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> Records:
     """Thumbnails of every modality, and the border of the tactile image."""
-
-    def pixels(modality: str, rows: np.ndarray) -> np.ndarray:
-        return np.concatenate([thumbnails(pack, m, rows) for m in names_in(modality, pack)], axis=1)
-
-    records = _named("pixels", None, probe_all(pixels, pack, tasks, modalities, ["linear"], 0))
+    found = probe_all(partial(thumbnails, pack), pack, tasks, modalities, ["linear"], 0)
+    records = _named("pixels", None, found)
     if "touch" in modalities:
-        found = probe_all(lambda m, rows: borders(pack, m, rows), pack, tasks, ["touch"], ["linear"], 0)
+        found = probe_all(partial(borders, pack), pack, tasks, ["touch"], ["linear"], 0)
         records += _named("border", None, found)
     return records
 

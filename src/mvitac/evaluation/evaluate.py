@@ -54,7 +54,7 @@ def probe(
         >>> scores["summary"]["category"]["touch"]["mvitac"]["mean"]  # doctest: +SKIP
     """
     pack = PackConfig(path=Path(on)).open() if isinstance(on, (str, Path)) else on
-    return probe_runs([Path(named(str(run))) for run in runs], ProbeConfig(**options), pack, allow_leak=allow_leak)
+    return probe_runs([named(Path(run)) for run in runs], ProbeConfig(**options), pack, allow_leak=allow_leak)
 
 
 def probe_runs(
@@ -280,7 +280,7 @@ def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[AnyTask], list[str]]:
     known = {task.name: task for task in pack.spec.all_tasks}
     if not known:
         what = f"dataset {pack.spec.name!r} has no labels and no values"
-        raise ValueError(f"{what}: name columns with --data.labels or --data.values")
+        raise ValueError(f"{what}: pack it with --labels or --values")
     for name in session.tasks:
         if name not in known:
             raise unknown("task", name, known)

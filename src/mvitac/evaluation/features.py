@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from mvitac.data.pack import Pack
-from mvitac.data.several import JoinedPack
 from mvitac.data.spec import MODALITIES
 from mvitac.model import Model
 from mvitac.system.files import cache_dir, digest, write_atomic
@@ -46,15 +45,6 @@ def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_h
 
     The cached file is a .npy followed by its sha256. One that does not match, or has none, is computed again.
     """
-    if isinstance(pack, JoinedPack) and (known := rows < pack.learn.num).any():
-        every = np.arange(pack.learn.num)
-        if _place(model, pack.learn, modality, every, for_heads=for_heads).exists():  # of a probe on that pack alone
-            learned = features(model, pack.learn, modality, every, for_heads=for_heads)[rows[known]]
-            values = np.empty((len(rows), *learned.shape[1:]), learned.dtype)
-            values[known] = learned
-            if not known.all():
-                values[~known] = features(model, pack, modality, rows[~known], for_heads=for_heads)
-            return values
     every = np.arange(pack.num)
     if len(rows) < pack.num and _place(model, pack, modality, every, for_heads=for_heads).exists():
         return features(model, pack, modality, every, for_heads=for_heads)[rows]

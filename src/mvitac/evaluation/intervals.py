@@ -84,7 +84,9 @@ def paired_difference(
 
 
 def mean_interval(values: np.ndarray) -> tuple[float, float, float, float]:
-    """Mean of ``values`` [seeds, groups], the ends of its 95 % interval over both, and the two-sided p of a mean of 0."""
+    """Mean of ``values`` [seeds, groups], the ends of its 95 % interval over both (none of one group), two-sided p of 0."""
+    if values.shape[1] < 2:
+        return float(values.mean()), -math.inf, math.inf, 1.0
     sizes, mean = np.ones(values.shape[1]), float(values.mean())
     groups, seeds = _over_groups(values.mean(0), sizes), _over_seeds(values, sizes)
     margin = _margin(groups, seeds)

@@ -1,6 +1,6 @@
 """Probes of one model's frozen features on one pack: linear classifiers, regression and kNN.
 
-Nothing is chosen on test rows: regularisation is chosen on held-out groups of train. Shapes: features [N, D].
+Nothing is chosen on test rows: regularisation is chosen on split val, or on groups of train. Shapes: features [N, D].
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +12,7 @@ import torch
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task, ValueTask
-from mvitac.evaluation.classifiers import Classifier, Constant, fit_knn, fit_linear, fit_papers
+from mvitac.evaluation.classifiers import Classifier, Constant, fit_knn, fit_linear, fit_papers, one_blas_thread
 from mvitac.evaluation.features import features
 from mvitac.evaluation.few_labels import few, percent_of
 from mvitac.evaluation.probe_config import Standardise
@@ -22,6 +22,7 @@ from mvitac.evaluation.sensors import touch_features
 from mvitac.evaluation.value_scores import score_values
 from mvitac.model import Model
 from mvitac.system.progress import tick
+from mvitac.system.threads import in_threads
 
 VALUE_PROBES = ("linear", "knn")
 """Probes of tasks with values: ridge regression, alpha chosen on validation groups, and the mean of the 20 nearest."""
@@ -117,15 +118,11 @@ def seen_by(pack: Pack, task: AnyTask, modalities: Sequence[str]) -> list[str]:
 
 def probe_features(
     x: np.ndarray, pack: Pack, task: AnyTask, rows: ProbeSplit, kind: str, seed: int, paper: Classifier | None = None
-) -> dict[str, Any]:
-    """Fit and score one probe of ``kind`` on features ``x`` of ``rows.all``; ``paper`` is an already fitted one."""
-    return fit_and_score(x, pack, task, rows, kind, seed, paper)[0]
-
-
-def fit_and_score(
-    x: np.ndarray, pack: Pack, task: AnyTask, rows: ProbeSplit, kind: str, seed: int, paper: Classifier | None = None
 ) -> tuple[dict[str, Any], tuple[Fitted, np.ndarray]]:
-    """``probe_features``, and the probe with what it predicts for the test rows."""
+    """Fit a probe of ``kind`` on features ``x`` of ``rows.all``; ``paper`` is an already fitted one.
+
+    Returns its record, and the probe with what it predicts for the test rows.
+    """
     if percent := percent_of(kind):
         train, val = few(pack, task, rows.train, rows.val, percent, seed)
         keep = np.concatenate([train, len(rows.train) + val, np.arange(len(rows.fitted), len(x))])
@@ -182,14 +179,9 @@ def probe_model(
     modalities = [m for m in modalities if set(names_in(m, pack)) <= set(model.encoders)]  # supervised: maybe one
     if not modalities:
         return []
-    parts = [split_rows(pack, task, m).all for task in tasks for m in seen_by(pack, task, modalities)]
-    needed = np.unique(np.concatenate(parts))
-    own = {m: needed[pack.has(m)[needed]] for m in model.encoders if m in modalities or "both" in modalities}
-
-    by_modality = {m: touch_features(model, pack, m, rows, standardise) for m, rows in own.items()}
 
     def source(modality: str, rows: np.ndarray) -> np.ndarray:
-        return np.concatenate([by_modality[m][np.searchsorted(own[m], rows)] for m in names_in(modality, pack)], axis=1)
+        return touch_features(model, pack, modality, rows, standardise)
 
     records = probe_all(source, pack, tasks, modalities, probes, model.seed, fitted)
     return records + own_heads(model, pack, tasks, modalities)
@@ -246,22 +238,35 @@ def probe_all(
 ) -> list[dict[str, Any]]:
     """Records of every (task, modality, probe) on the features of ``source``. The paper's probe has no values.
 
-    ``fitted`` receives the probes. Each of them advances the ``progress.work`` that counts "probes".
+    ``source`` is asked once for each of touch and vision, with ascending rows. ``fitted`` receives the probes. Each of them
+    advances the ``progress.work`` that counts "probes".
     """
+    pairs = [(task, modality) for task in tasks for modality in seen_by(pack, task, modalities)]
+    needed = np.unique(np.concatenate([np.arange(0), *(split_rows(pack, *pair).all for pair in pairs)]))
+    names = dict.fromkeys(name for _, modality in pairs for name in names_in(modality, pack))
+    own = {name: needed[pack.has(name)[needed]] for name in names}
+    known = {name: source(name, rows) for name, rows in own.items()}
+
+    def read(modality: str, rows: np.ndarray) -> np.ndarray:
+        return np.concatenate([known[m][np.searchsorted(own[m], rows)] for m in names_in(modality, pack)], axis=1)
+
     classed = [task for task in tasks if isinstance(task, Task)]
-    papers = _papers(source, pack, classed, modalities, seed) if "paper" in probes else {}
-    records = []
-    for task in tasks:
-        for modality in seen_by(pack, task, modalities):
-            rows = split_rows(pack, task, modality)
-            x = source(modality, rows.all)
-            for kind in probes_of(task, probes):
-                result, made = fit_and_score(x, pack, task, rows, kind, seed, papers.get((task.name, modality)))
-                if fitted is not None:
-                    fitted[task.name, modality, kind] = made
-                tick("probes")
-                records.append({"task": task.name, "modality": modality, "probe": kind, **result})
-    return records
+    papers = _papers(read, pack, classed, modalities, seed) if "paper" in probes else {}
+
+    def probed(pair: tuple[AnyTask, str]) -> list[dict[str, Any]]:
+        task, modality = pair
+        rows, records = split_rows(pack, task, modality), []
+        x = read(modality, rows.all)
+        for kind in probes_of(task, probes):
+            result, made = probe_features(x, pack, task, rows, kind, seed, papers.get((task.name, modality)))
+            if fitted is not None:
+                fitted[task.name, modality, kind] = made
+            tick("probes")
+            records.append({"task": task.name, "modality": modality, "probe": kind, **result})
+        return records
+
+    with one_blas_thread():
+        return [record for records in in_threads(probed, pairs) for record in records]
 
 
 def probes_of(task: AnyTask, probes: Sequence[str]) -> list[str]:

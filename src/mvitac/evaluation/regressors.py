@@ -15,7 +15,7 @@ from sklearn.neighbors import KNeighborsRegressor
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import SplineTransformer
 
-from mvitac.evaluation.classifiers import NEIGHBOURS, threadpools
+from mvitac.evaluation.classifiers import NEIGHBOURS, one_blas_thread
 from mvitac.evaluation.diagnostics import BEYOND
 
 Regressor = Callable[[np.ndarray], np.ndarray]
@@ -98,7 +98,7 @@ def _fit_each(x: np.ndarray, y: np.ndarray, num_val: int, before: Pipeline) -> L
     x = x.astype(np.float64)  # in float32 the normal equations of correlated features are ill-conditioned
     first = np.arange(len(x)) < len(x) - num_val
     ridges = []
-    with threadpools().limit(limits=1):  # as for logistic regression: threads wait longer than they compute
+    with one_blas_thread():
         part = before.fit(x[first]).transform(x) if first.any() else x
         whole = before.fit(x).transform(x)
         for target in y.T:

@@ -301,4 +301,4 @@ def _frozen(job: _Job, percent: float, seed: int, task: AnyTask) -> dict[str, An
     names = job.run.method.modalities  # type: ignore[attr-defined]
     x = np.concatenate([features(job.model, job.pack, m, parts.all) for m in names], axis=1)
     known = {"task": task.name, "modality": job.modality, "probe": "linear"}
-    return {**known, **probe_features(x, job.pack, task, parts, "linear", seed)}
+    return {**known, **probe_features(x, job.pack, task, parts, "linear", seed)[0]}

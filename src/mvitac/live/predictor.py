@@ -174,10 +174,8 @@ class Live:
         if self.contact:
             self.touch = self.answer
         self.outputs = outputs = self.engine(**{m: image[None] for m, image in given.items()})
-        self.answer.add(
-            {task: outputs[f"probability_{task}"][0] for task in self.engine.classes},
-            {task: outputs[f"value_{task}"][0] for task in self.engine.values},
-        )
+        classes = {task: outputs[f"probability_{task}"][0] for task in self.engine.classes}
+        self.answer.add(classes, {task: outputs[f"value_{task}"][0] for task in self.engine.values})
         self.ages.append(self.clock() - captured)
         self.max_age = max(self.max_age, self.ages[-1])
         self.num_predictions += 1

@@ -65,9 +65,8 @@ class BYOL(Contrastive):
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         seen = (m for m in self.towers if ("q", m, 0) in z)
-        return with_sum(
-            {m: regression(z["q", m, 0], z["k", m, 1]) + regression(z["q", m, 1], z["k", m, 0]) for m in seen}
-        )
+        losses = {m: regression(z["q", m, 0], z["k", m, 1]) + regression(z["q", m, 1], z["k", m, 0]) for m in seen}
+        return with_sum(losses)
 
     def after_step(self, progress: float) -> None:
         for target in self.target.values():

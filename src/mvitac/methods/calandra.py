@@ -23,9 +23,8 @@ class CalandraConfig(LabelledConfig):
     name: ClassVar[str] = "calandra"
 
     def build(self, spec: DataSpec, encoder: Encoders) -> Supervised:
-        streams: dict[str, nn.Module] = {
-            m: Streams(encoder[m], spec.channels(m) // 3) for m in self.modalities_of(spec)
-        }
+        names = self.modalities_of(spec)
+        streams: dict[str, nn.Module] = {m: Streams(encoder[m], spec.channels(m) // 3) for m in names}
         width = sum(num_features(stream) for stream in streams.values())
 
         def layers(num: int) -> nn.Module:

@@ -34,7 +34,7 @@ class Init:
     def file(self) -> Path:
         """The file with the weights; ValueError if there is none."""
         assert self.path is not None
-        place = Path(named(str(self.path)))
+        place = named(self.path)
         file = place / MODEL if place.is_dir() else place
         if not file.is_file():
             unfinished = "; its run is not finished, continue it with --resume" * (place / "checkpoint.pt").exists()

@@ -118,6 +118,8 @@ def load_weights(network: nn.Module, tensors: State, file: Path | str) -> None:
     ((start, state),) = fitting.items()
     if bad := [name for name, value in state.items() if value.is_floating_point() and not value.isfinite().all()]:
         raise ValueError(f"{file} holds NaN or infinite numbers: {_some(bad)}")
+    if not any(value.any() for value in state.values() if value.ndim > 1):
+        raise ValueError(f"{file} holds weights that are all 0")
     network.load_state_dict(state)
     if start:
         beside = [name for name in tensors if not name.startswith(start)]
@@ -154,10 +156,8 @@ def _converted(network: nn.Module, state: State) -> State:
         found = convert(dict(state), network) if convert else state
     except Exception:  # whatever timm's function makes of another network's weights
         return state
-    patches, shapes = (
-        found.get("patch_embed.proj.weight"),
-        {tensor.shape for tensor in state.values() if tensor.ndim == 4},
-    )
+    patches = found.get("patch_embed.proj.weight")
+    shapes = {tensor.shape for tensor in state.values() if tensor.ndim == 4}
     return found if patches is None or not shapes or patches.shape in shapes else state
 
 

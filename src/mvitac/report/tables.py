@@ -177,9 +177,7 @@ def print_finetuning(result: dict[str, Any], file: TextIO | None = None) -> None
         (_, ours), *others = cells.items()
         score = "R2" if "r2" in next(iter(ours.values()))[0] else "accuracy"
         columns = [f"{score} %", *(f"{f:g} % of {result['group_by']}s" for f in ours)]
-        texts = {
-            s: [with_interval(*interval(each), leaks_in(each)) for each in found.values()] for s, found in cells.items()
-        }
+        texts = {s: [with_interval(*interval(e), leaks_in(e)) for e in found.values()] for s, found in cells.items()}
         rows = [[source, *(text.replace(" LEAK", "\nLEAK") for text in found)] for source, found in texts.items()]
         rows += [[f"gain over {s}", *(_gain_text(ours[f], found[f]) for f in ours)] for s, found in others]
         print(text_table(f"{result['data']}: {task}", columns, rows), file=file)

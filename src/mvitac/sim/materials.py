@@ -149,9 +149,8 @@ def touch(
         raise ValueError(f"through {through}: there are {len(choice)} sensors for one spot, give a smaller number")
     again = np.random.default_rng([_TAG, seed, category, instance, touch, 0, through]) if through else None
     vision = _look(thing, again or eye, angle + (again or eye).normal(0, 0.1), place, size)
-    pressed = _feel(
-        thing, finger, angle + finger.normal(0, 0.1), place, size, choice, background, measured, through, again
-    )
+    turn = angle + finger.normal(0, 0.1)
+    pressed = _feel(thing, finger, turn, place, size, choice, background, measured, through, again)
     return {
         "vision": vision,
         "category": category,

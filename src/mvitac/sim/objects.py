@@ -159,10 +159,8 @@ def _bottle(rng: np.random.Generator) -> tuple[Part, ...]:
 def _tee(rng: np.random.Generator) -> tuple[Part, ...]:
     x, y, z, a, b, c = _mm(rng, (11, 20), (36, 62), (13, 20), (12, 26), (12, 22), (10, 22))
     shift = rng.choice([-1, 1]) * rng.uniform(0.3, 0.75) * y
-    return (
-        Part("box", (x, y, z), (0, 0, z)),
-        Part("box", (a, b, c), (0, shift, 2 * z + c), density=rng.uniform(0.8, 1.4)),
-    )
+    top = Part("box", (a, b, c), (0, shift, 2 * z + c), density=rng.uniform(0.8, 1.4))
+    return Part("box", (x, y, z), (0, 0, z)), top
 
 
 def _dumbbell(rng: np.random.Generator) -> tuple[Part, ...]:

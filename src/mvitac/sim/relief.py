@@ -208,10 +208,8 @@ class Relief:
         wave = np.float32(self.wavelength_mm)
         u, v = x / (wave * np.float32(self.anisotropy)), y / wave
         bend = np.float32(0.45 * self.irregularity)
-        u, v = (
-            u + bend * noise(0.6 * u, 0.6 * v + 31, self.tables[3]),
-            v + bend * noise(0.6 * u + 31, 0.6 * v, self.tables[2]),
-        )
+        across, along = noise(0.6 * u, 0.6 * v + 31, self.tables[3]), noise(0.6 * u + 31, 0.6 * v, self.tables[2])
+        u, v = u + bend * across, v + bend * along
         height = KINDS[self.kind](u, v, self.tables)
         height = (height - height.mean()) / (height.std() + np.float32(1e-6))
         height = height + np.float32(0.1 + 0.5 * self.irregularity) * fractal(2.7 * u, 2.7 * v, self.tables[1], 2)

@@ -5,7 +5,7 @@ import json
 import re
 import textwrap
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from statistics import mean
@@ -68,14 +68,14 @@ class Log:
             self.since, self.since_step = time.perf_counter(), step
         self.advance_bar(1, f"loss {self.loss}, {self.speed} pairs/s" if self.loss else "")
 
-    def evaluation(self, step: int, values: dict[str, float], verdict: str = "") -> None:
-        """Log ``values`` of an evaluation, and print a row of the table; ``verdict`` is a sentence about the whole run."""
-        self._write({"step": step, "eval": values, **({"verdict": verdict} if verdict else {})})
+    def evaluation(self, step: int, values: dict[str, float], verdict: Sequence[str] = ()) -> None:
+        """Log ``values`` of an evaluation, and print a row of the table; ``verdict``: clauses about the whole run."""
+        self._write({"step": step, "eval": values, **({"verdict": "; ".join(verdict)} if verdict else {})})
         if step == 0:
             self.first = values
         if columns := shown_scores(values):
             self._row(step, columns, values)
-        for clause in verdict.split("; ") if verdict else ():
+        for clause in verdict:
             if "neither: " in clause:  # their figures are in log.jsonl
                 clause = re.sub(r" [+-][\d.]+( \[[^]]*\])?", "", clause)
             self.say(textwrap.fill(clause, WIDTH, subsequent_indent="    "))
@@ -96,7 +96,9 @@ class Log:
 
     def _heads(self, columns: dict[str, list[str]], widths: dict[str, int], values: dict[str, float]) -> None:
         both = " by touch and vision" * any("both/" in key for keys in columns.values() for key in keys)
-        about = f"on held-out groups (split val): linear probe{both}; change of the mean in points"
+        unseen = any(rows for key, rows in values.items() if key.endswith("held-out rows"))
+        where = "on held-out groups (split val)" if unseen else "on training rows (split val has none)"
+        about = f"{where}: linear probe{both}; change of the mean in points"
         if "chance R@5" in values:
             about += f"; R@5 by chance {100 * values['chance R@5']:.1f}"
         if left := len(columns) - len(widths):
@@ -191,13 +193,11 @@ def open_loggers(name: str | None, out: Path, run: Run) -> Iterator[tuple[Logger
     started: list[Any] = []
 
     def send(step: int, values: dict[str, float]) -> None:
+        board = name == "tensorboard"
         if not started:  # only now: a run that is refused must leave no files, since --out must be new
-            started.append(
-                library.SummaryWriter(str(out / "tensorboard"))
-                if name == "tensorboard"
-                else library.init(project="mvitac", name=out.name, config=to_json(run))
-            )
-        if name == "tensorboard":
+            about = {"project": "mvitac", "name": out.name, "config": to_json(run)}
+            started.append(library.SummaryWriter(str(out / "tensorboard")) if board else library.init(**about))
+        if board:
             for key, value in values.items():
                 started[0].add_scalar(key, value, step)
         else:  # wandb and trackio have the same functions

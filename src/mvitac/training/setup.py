@@ -1,4 +1,4 @@
-"""Set-up of pre-training: everything that happens before the first step, and every check that can be made there."""
+"""What happens before the first step, in the order of ``set_up``: data, precision, method, checkpoint, locked features."""
 
 import sys
 from collections.abc import Callable

@@ -53,10 +53,11 @@ class Validation:
             if self.run.eval_every:
                 model.save(self.out / BEST)
                 self.method.train()
-        said = verdict(self.kept["start"], cells, self.pack.spec.group_by) if last else ""
-        if last and self.run.eval_every and cells:
-            change = 100 * (self.kept["best"] / _error(self.kept["start"]) - 1)
-            said += f"; best at step {self.kept['best_step']} (errors {change:+.0f} % in the mean over tasks, {BEST})"
+        start = self.kept.get("start") if last else None  # a run that began without validation has none
+        said = [] if start is None else verdict(start, cells, self.pack.spec.group_by)
+        if start and self.run.eval_every and cells:
+            change = f"errors {100 * (self.kept['best'] / _error(start) - 1):+.0f} % in the mean over tasks"
+            said += [f"best at step {self.kept['best_step']} ({change}, {BEST})"]
         self.log.evaluation(step, values, said)
 
 
@@ -101,6 +102,7 @@ def _validate(model: Model, pack: Pack, run: Run, locked: Mapping[str, Tensor]) 
     for modality, features in z.items():
         values[f"{modality}/std"] = diagnostics.spread(features)
         values[f"{modality}/rankme"] = diagnostics.rank_me(features)
+    values["held-out rows"] = float(held_out * len(rows))
     if held_out:
         cells = _linear(pack, train_rows, rows, {m: read(m, train_rows) for m in z}, z)
         values |= {name: float(_scores(cell).mean()) for name, cell in cells.items()}
@@ -173,8 +175,8 @@ def _error(cells: Cells) -> float:
     return diagnostics.mean_error(_scores(cell).tolist() for cell in cells.values())
 
 
-def verdict(start: Cells, end: Cells, by: str) -> str:
-    """One sentence: what of the linear probe's scores on split val rose since the start, and what fell.
+def verdict(start: Cells, end: Cells, by: str) -> list[str]:
+    """The clauses of a sentence: what of the linear probe's scores on split val rose since the start, and what fell.
 
     Each interval (95 %) is over groups: a jackknife that leaves out one at a time. Variation between seeds is not in it.
     """
@@ -192,23 +194,20 @@ def verdict(start: Cells, end: Cells, by: str) -> str:
             word = "neither" if abs(points) <= margin else "rose" if points > 0 else "fell"
             text += f" [{points - margin:+.1f}, {points + margin:+.1f}]"
         said[word].append(text)
-    found = "; ".join(f"{word}: {', '.join(texts)}" for word, texts in said.items() if texts)
+    found = [f"{word}: {', '.join(texts)}" for word, texts in said.items() if texts]
     if not found:
-        return "no labels of two classes, and no values, in split val: nothing says what the features are worth"
-    return f"compared with the start (linear probe, points of accuracy or R2 on {by}s of val), {found}"
+        return ["split val has no labels of two classes, and no values: nothing says what the features are worth"]
+    return [f"compared with the start (linear probe, points of accuracy or R2 on {by}s of val), {found[0]}", *found[1:]]
 
 
 def _change(start: Tensor, end: Tensor) -> tuple[float, float]:
     """How many points a score has risen, and half the width of its interval over groups (0 for one group)."""
 
-    def gain(keep: Tensor) -> Tensor:
-        return 100 * (_scores(end[:, keep]).mean() - _scores(start[:, keep]).mean())
-
-    every = torch.arange(num := end.shape[1])
-    points = float(gain(every))
+    points, num = float(100 * (_scores(end) - _scores(start)).mean()), end.shape[1]
     if num < 2:
         return points, 0.0
-    without = torch.stack([gain(every[every != g]) for g in every])
+    before, after = (cell.sum(1, keepdim=True) - cell for cell in (start, end))  # without each group
+    without = 100 * (_scores(after[:, None]) - _scores(before[:, None])).mean(0)  # [groups]
     squares = (num - 1) / num * float((without - without.mean()).square().sum())
     return points, float(stdtrit(num - 1, 0.975)) * squares**0.5
 

@@ -81,9 +81,8 @@ class StepViews:
             load = self.locked[m].__getitem__ if m in self.locked else partial(self.feed, m)
             fed = {name: load(source) for name, source in own.items()}
             how = run.augment.of(m), run.augment.size_of(m), generator, dtype, run.encoder[m].levels
-            images[m] = [
-                fed[id(source)] if m in self.locked else random_view(fed[id(source)], *how) for source in sources[m]
-            ]
+            shown = [fed[id(source)] for source in sources[m]]
+            images[m] = shown if m in self.locked else [random_view(one, *how) for one in shown]
         splits = run.method.label_splits
         labels = {t.name: torch.from_numpy(pack.labels(t.name, *splits)[rows]).to(to) for t in pack.spec.tasks}
         values = {task: value.to(to) for task, value in values_of(run, pack, rows).items()}

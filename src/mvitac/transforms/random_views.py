@@ -163,9 +163,8 @@ def _crop(image: UInt8[Tensor, "C H W"], box: list[int], flip: bool, size: int) 
     top, left, height, width = box
     crop = image[:, top : top + height, left : left + width].unflatten(0, (-1, 3))  # [sensors, 3, h, w]
     if (height, width) != (size, size):  # torch's uint8 kernel is vectorised for channels-last images
-        crop = F.interpolate(
-            crop.contiguous(memory_format=torch.channels_last), (size, size), mode="bilinear", antialias=True
-        )
+        crop = crop.contiguous(memory_format=torch.channels_last)
+        crop = F.interpolate(crop, (size, size), mode="bilinear", antialias=True)
     if flip:
         crop = crop.flip(-1)
     return crop.permute(2, 3, 0, 1).reshape(size, size, -1)

@@ -49,6 +49,8 @@ class Recordings(Source):
         rng = np.random.default_rng([11, item])
         force = 0.2 + (2.5 + 0.1 * (k // 2 % 4)) * np.sin(np.pi * i / LENGTH) + 0.01 * rng.normal()
         tilt = 0.3 * np.sin(k + i / 5)
+        if fault == "placeholder" and i % 8 == 5:
+            force = -1.0
         if fault == "outlier" and i == 5:
             force = -999.0
         if fault == "stuck" and k == 4 and 10 <= i < 24:
@@ -83,6 +85,7 @@ def test_healthy_values(healthy: Pack) -> None:
     ("fault", "item", "says", "rows"),
     [
         ("outlier", "values of force", "16 outliers, e.g. -999 in row 5", [5, 45]),
+        ("placeholder", "values of force", "80 of 640 (12.5 %) rows have -1 exactly", [5, 13]),
         ("stuck", "values of force", "1 constant stretches, the longest 14 frames of 2 from row 170", [170]),
         ("outside", "values of force", "test rows are outside train (0.1", []),
     ],

@@ -27,9 +27,8 @@ def judged(
 ) -> Finding:
     """A finding that is broken, worth a ``look``, or ok, and then without ``advice``."""
     wrong = look or broken
-    return Finding(
-        item, "broken" if broken else "look" if look else "ok", evidence, advice * wrong, rows if wrong else ()
-    )
+    verdict = "broken" if broken else "look" if look else "ok"
+    return Finding(item, verdict, evidence, advice * wrong, rows if wrong else ())
 
 
 def exit_code(findings: Iterable[Finding]) -> int:

@@ -120,7 +120,6 @@ def motion_correlations(pack: Pack, looks: dict[str, ImageStats], when: np.ndarr
             z = [(e - e.mean()) / e.std() for e in energy]
             n = len(z[0])
             lags = range(-MAX_LAG, MAX_LAG + 1)
-            curves.append(
-                [float(np.mean(z[0][max(0, -k) : n - max(0, k)] * z[1][max(0, k) : n + min(0, k)])) for k in lags]
-            )
+            pairs = ((z[0][max(0, -k) : n - max(0, k)], z[1][max(0, k) : n + min(0, k)]) for k in lags)
+            curves.append([float(np.mean(a * b)) for a, b in pairs])
     return np.array(curves).reshape(-1, 2 * MAX_LAG + 1)

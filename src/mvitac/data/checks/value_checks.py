@@ -19,11 +19,8 @@ reported if more than this share of them is (measured on the 33 grasps of docs/v
 def values(pack: Pack) -> list[Finding]:
     """Return one finding per target of a task with values."""
     touches = _touches(pack)
-    return [
-        _finding(pack, task, target, pack.values(task)[:, t], touches)
-        for task in pack.spec.values
-        for t, target in enumerate(task.targets)
-    ]
+    asked = [(task, t) for task in pack.spec.values for t in range(len(task.targets))]
+    return [_finding(pack, task, task.targets[t], pack.values(task)[:, t], touches) for task, t in asked]
 
 
 def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, touches: list[np.ndarray]) -> Finding:
@@ -41,6 +38,7 @@ def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, tou
         evidence.append(f"{share(missing, missing + len(rows))} rows of train, val and test have none")
     checks = {
         "repair these cells, or leave them empty": _outliers(rows, known),
+        "a placeholder or a saturated sensor: leave these cells empty": _placeholder(rows, known),
         "a stuck or saturated sensor: leave these cells empty": _stuck(found, touches),
         "expect larger errors there, or split so that train covers test": _outside(found, measured, target),
     }
@@ -74,6 +72,16 @@ def _outliers(rows: np.ndarray, known: np.ndarray) -> Note:
         return "", []
     usual = f"(the others are {known[~far].min():.4g} to {known[~far].max():.4g})"
     return f"{int(far.sum())} outliers, e.g. {known[far][0]:.4g} in row {rows[far][0]} {usual}", rows[far].tolist()
+
+
+def _placeholder(rows: np.ndarray, known: np.ndarray) -> Note:
+    """The lowest or the highest value in over 5 % of the rows, where hardly another one repeats: such as -1 among forces."""
+    values, counts = np.unique(known, return_counts=True)
+    distinct = len(values) - 1 > 0.8 * (len(known) - counts.max())
+    if not distinct or counts.argmax() not in (0, len(values) - 1) or counts.max() <= max(3, len(known) / 20):
+        return "", []
+    at = np.flatnonzero(known == (value := values[counts.argmax()]))
+    return (f"{share(len(at), len(known))} rows have {value:.4g} exactly", rows[at].tolist()) if value else ("", [])
 
 
 def _stuck(found: np.ndarray, touches: list[np.ndarray]) -> Note:
@@ -116,11 +124,8 @@ def time_shift(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     notes, suspects = [], []
     for task in pack.spec.values:
         for t, target in enumerate(task.targets):
-            found = [
-                _shift(change, pack.values(task)[:, t], block)
-                for rows in touches
-                for block in np.array_split(rows, -(-len(rows) // BLOCK))
-            ]
+            blocks = (block for rows in touches for block in np.array_split(rows, -(-len(rows) // BLOCK)))
+            found = [_shift(change, pack.values(task)[:, t], block) for block in blocks]
             sign = np.sign(sum(curve[abs(curve).argmax()] for _, curve in found)) or 1.0
             known = [(rows, sign * curve) for rows, curve in found if (sign * curve).max() >= CLEAR]
             late = [(rows, _lag(c)) for rows, c in known if c.max() - c[len(c) // 2] > GAIN]

@@ -95,7 +95,7 @@ def join(
         name, column, shift = _parsed(text)
         times, recordings = row_times(table, column, refs)
         made: list[Row] = [{} for _ in table.rows]
-        gap, same = 0.0, 0
+        gap, same, apart = 0.0, 0, 0
         for file, at in _files(table, name, refs).items():
             log = with_elements(read_manifest(file), numbers)
             if (whole := text.removeprefix(f"{name}:")) != column and whole in log.columns:
@@ -103,7 +103,8 @@ def join(
             log.check(column)
             _check_apart(file, times[at], [recordings[i] for i in at])
             stamps = seconds(log.filled(column, "time"), f"{file}, column {column}") + shift
-            same += len(stamps) - len(np.unique(stamps))
+            same += len(stamps) - (distinct := len(np.unique(stamps)))
+            apart += len({(at, *row.values()) for at, row in zip(stamps, log.rows, strict=True)}) - distinct
             cells, largest = joined(log, stamps, times[at], (numbers if linear else ()), tolerance)
             gap = max(gap, largest)
             if not any(cells):
@@ -122,6 +123,7 @@ def join(
         note = f"{name} joined by {text.removeprefix(f'{name}:')}, its largest gap is {gap:.3g} s"
         note += lost * (not all(there))
         note += f"; {same} of its rows have the stamp of another, of which one counts" * bool(same)
+        note += f", and {apart} of these say something else than another" * bool(apart)
         rows = [{**row, **{c: more.get(c, "") for c in names}} for row, more in zip(table.rows, made, strict=True)]
         table = replace(table, rows=rows, digest=digest([table.digest, made]), notes=(*table.notes, note))
         table = table.kept(there, "")

@@ -129,10 +129,11 @@ class RowsConfig(DatasetConfig, ABC):
 
     def control_columns(self) -> dict[str, tuple[str, ...]]:
         """Return control name -> manifest columns."""
-        pairs = [text.partition("=") for text in self.controls]
-        if len({name.strip() for name, _, _ in pairs}) < len(pairs):
+        pairs = [text.rpartition("=") for text in self.controls]  # one of a single column may be named after it
+        found = {(name or listed).strip(): tuple(c.strip() for c in listed.split(",")) for name, _, listed in pairs}
+        if len(found) < len(pairs):
             raise ValueError(f"controls {' '.join(self.controls)}: give every control a name of its own")
-        return {name.strip(): tuple(c.strip() for c in listed.split(",")) for name, _, listed in pairs}
+        return found
 
     def numbers(self) -> list[str]:
         """Return the manifest columns that hold numbers: those of values, and those of controls."""
@@ -319,7 +320,7 @@ class Rows(Source):
             for column in self._images:  # file names up to their last number
                 files = (os.path.splitext(os.path.basename(ref.path))[0] if ref else "" for ref in table.images[column])
                 if (stems := [re.sub(r"\d+\D*$", "", file) for file in files]) not in texts.values():
-                    texts[f"{column} files"] = stems
+                    texts[f"names of {column} files"] = stems
             notes.append(columns.ungrouped(texts, assigned))
         return tuple(notes)
 
