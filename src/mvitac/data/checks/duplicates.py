@@ -65,7 +65,7 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     item, evidence = "near-copies across splits", "; ".join(notes)
     if not compared:
         return Finding(item, "not checkable", evidence)
-    advice = "look at the sheet (pairs side by side); if they are one contact or one scene, group them"
+    advice = "see the pairs (--sheet FILE.png); if they are one contact or one scene, group them"
     return judged(item, evidence, advice, rows, look=suspicious)
 
 

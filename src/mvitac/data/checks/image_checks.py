@@ -48,7 +48,7 @@ def red_and_blue(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         notes.append(f"{name}: {note}")
     if not compared:
         return Finding("red and blue swapped", "not checkable", "; ".join(notes))
-    advice = "look at the sheet; if they are BGR (OpenCV's order), reverse their channels when reading"
+    advice = "see them (--sheet FILE.png); if they are BGR (OpenCV's order), reverse their channels when reading"
     return judged("red and blue swapped", "; ".join(notes), advice, rows, look=bool(rows))
 
 
