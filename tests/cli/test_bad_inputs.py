@@ -360,6 +360,12 @@ def test_a_place_nothing_can_be_written_to(
     refused(command.replace("{out}", out), says)
 
 
+def test_an_output_that_is_an_input(refused: Callable[..., str], finished: Path) -> None:
+    for name in ("model.safetensors", "run.json"):
+        refused(f"probe {finished} --json {finished / name}", "would overwrite what the command reads")
+    refused(f"bench board {finished}/run.json --out {finished}/run.json", "would overwrite what the command reads")
+
+
 def fill_disk(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """Files whose name holds ``name`` appear, but take no byte: /dev/full is the kernel's own full disk."""
     real = Path.open

@@ -209,12 +209,15 @@ def test_command(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "gives 1 numbers" in capsys.readouterr().err
     for code, says in (
         ("return [np.nan, 0]", "gives [nan 0.] in step 0 of episode 1"),
-        ("seen.append(0)\n    return [len(seen), 0]", "acts differently on the same episodes: give it reset()"),
+        ("seen.append(0)\n    return [1e-4 * len(seen), o['step']]", "acts differently on the same episodes"),
         ("sys.exit(0)", "fails (SystemExit: 0)"),
     ):
         file.write_text(f"import sys, numpy as np\nseen = []\ndef policy(o):\n    {code}\n")
         assert main(["ablate", f"{file}:policy", "--data", str(pack.path)]) == 2
         assert says in capsys.readouterr().err
+    file.write_text("def policy(o): ...\npolicy.reset = lambda: 1 / 0\n")
+    assert main(["ablate", f"{file}:policy", "--data", str(pack.path)]) == 2
+    assert "fails (ZeroDivisionError: division by zero) when reset before episode 1" in capsys.readouterr().err
     file.write_text("import nothing_such\n")
     with pytest.raises(ValueError, match=r"mine.py:policy cannot be imported \(ModuleNotFoundError: .*nothing_such"):
         open_policy(f"{file}:policy")

@@ -194,6 +194,7 @@ def test_logs_that_would_give_wrong_numbers(tmp_path: Path, change: Callable[[Pa
         ({"log": ("force.csv",)}, r"log 'force\.csv': write FILE:COLUMN"),
         ({"log": ("force:stamp",)}, r"force cannot be read as a table: it is no file of \.csv"),
         ({"log": ("force.csv:stamp",), "labels": ("gel",)}, "column 'gel' holds images, not text or numbers"),
+        ({"log": ("back.csv:t",)}, r"back\.csv: the clock goes back after row 2: mend it"),
         ({"log": ("twice.csv:t-1",)}, r"has a column 't-1', which reads as 't' and a shift: rename it"),
         ({"log": ("pipe.csv:stamp",)}, r"pipe\.csv cannot be read as a table: it is no file of"),
         ({"log": ("force.csv:stamp", "force.csv:stamp")}, r"both have a column 'Fz': rename one"),
@@ -203,6 +204,7 @@ def test_logs_that_cannot_be_joined(tmp_path: Path, options: dict[str, Any], say
     root = recorded(tmp_path / "set", num=1)
     os.mkfifo(root / "0/pipe.csv")  # reading it would wait for ever
     write_csv(root / "0/twice.csv", **{"t": [0, 1], "t-1": [1, 2]})
+    write_csv(root / "0/back.csv", t=[0, 1, 0.4, 1.4], x=[0, 1, 2, 3])
     with pytest.raises(ValueError, match=says):
         packed(root, tmp_path / "p", **{**LOG, **options})
 
@@ -210,7 +212,7 @@ def test_logs_that_cannot_be_joined(tmp_path: Path, options: dict[str, Any], say
 def test_rows_with_one_stamp_are_counted(tmp_path: Path) -> None:
     root = recorded(tmp_path / "set", num=2)
     spoil(36, stamp=lambda _: "0.34")(root)
-    spoil(37, 38, stamp=lambda _: "0.39")(root)
+    spoil(37, 38, stamp=lambda _: "0.29")(root)
     own_times("txt", *(round(0.04 * i, 1) for i in range(50)))(root)
     pack = packed(root, tmp_path / "p", **LOG)
     note = next(note for note in pack.spec.notes if "joined" in note)

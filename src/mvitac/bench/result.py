@@ -248,7 +248,8 @@ def _impossible(record: dict[str, Any], num_groups: int) -> str:
         return f"its fields are {sorted(record)}, its sums {sorted(record['sums'])}"
     try:
         sums = {name: np.array(record["sums"][name], float) for name in names}
-    except (TypeError, ValueError):
+        assert all(np.array(values).dtype.kind in "iuf" for values in record["sums"].values())
+    except (AssertionError, TypeError, ValueError):
         return "its sums are no numbers"
     n = sums["n"] = np.atleast_2d(sums["n"])
     if any(np.atleast_2d(each).shape != n.shape for each in sums.values()) or n.shape[1] > num_groups:
@@ -272,5 +273,6 @@ def _impossible(record: dict[str, Any], num_groups: int) -> str:
         (sums["squared_error"] < least * low) | (least * sums["squared_error"] > high)
     ).any():
         return "its squared errors are smaller or larger than its errors allow"
-    small = (sums["squared_value"] * n < least * sums["value"] ** 2).any()
-    return "its squares are smaller than its values allow" if small else ""
+    square, of = sums["squared_value"] * n, sums["value"] ** 2
+    wrong = (square < least * of).any() or (least * square > of)[n == 1].any()
+    return "its squares are not those of its values" if wrong else ""

@@ -39,6 +39,17 @@ COMMANDS = {
 }
 """Command -> module of this package:function, imported when called."""
 
+OWN = (
+    ".safetensors",
+    ".npy",
+    ".onnx",
+    ".pt",
+    "samples.parquet",
+    "run.json",
+    "pack.json",
+    "export.json",
+    "artifact.json",
+)
 HEAVY = ("demo", "pretrain", "finetune", "compare", "bench")
 """Commands whose options need torch. The others import it once their options are known to be right."""
 
@@ -97,6 +108,7 @@ def _run(arguments: list[str]) -> int:
         return 0
     if not {"-h", "--help"} & set(rest):
         _check_choices(rest, text)
+        _check_outputs(rest)
         if name in HEAVY:
             from mvitac.cli.options import loading
 
@@ -115,6 +127,17 @@ def _check_choices(rest: Sequence[str], text: Path) -> None:
         value = next(iter(rest[rest.index(option) + 1 :]), choices[0])
         if value not in choices and not Path(value).exists():
             raise unknown({"--data": "dataset"}.get(option, option[2:]), value, choices)
+
+
+def _check_outputs(words: Sequence[str]) -> None:
+    """ValueError for an output that is an input, or a file of a run, pack or export that is one."""
+    places = [re.sub(r"#.*|@[\d.]+$", "", word.rpartition("=")[2]) for word in words]
+    for at, (option, out) in enumerate(zip(words, places[1:], strict=False)):
+        if option in ("--out", "--json", "--sheet") and os.path.isfile(out):
+            inputs = [place for place in (*places[: at + 1], *places[at + 2 :]) if os.path.exists(place)]
+            own = [os.path.join(place, os.path.basename(out)) for place in inputs if out.endswith(OWN)]
+            if any(os.path.exists(place) and os.path.samefile(out, place) for place in (*inputs, *own)):
+                raise ValueError(f"{option} {out} would overwrite what the command reads: choose another file")
 
 
 def help_file(command: str) -> Path:

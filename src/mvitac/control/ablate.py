@@ -41,6 +41,7 @@ LAG = 10
 PLAUSIBLE = ("another episode", f"{LAG} frames ago")  # what a policy may have met: others may just surprise it
 KINDS = ("mean frame", *PLAUSIBLE, "noise")
 SMALL = 0.02  # standard deviations of the action; below this a policy does not react
+SAME = 1e-3  # standard deviations by which answers to the same images may differ, as a GPU's do
 FRAMES = 200  # that the mean frame and the strength of noise are of
 
 
@@ -192,7 +193,7 @@ def act(
     replaced = replacement(kind, episodes.images[sense], episodes.rows) if kind else None
     actions, losses, lengths = [], [], []
     for number, begin in enumerate(episodes.begin):
-        getattr(policy, "reset", lambda: None)()
+        _given(getattr(policy, "reset", lambda: None), f"when reset before episode {number + 1}")
         world, seen, step = begin(), deque(maxlen=LAG + 1), 0
         while not world.over:
             given = {**getattr(world, "values", {}), "step": step, **{each: world.look(each) for each in world.senses}}
@@ -215,13 +216,18 @@ def act(
 
 def _action(policy: Policy, given: dict[str, Any], number: int) -> np.ndarray:
     """What ``policy`` answers [T]; ValueError if that is not finite numbers, or it raises anything."""
+    place = f"in step {given['step']} of episode {number + 1}"
+    action = _given(lambda: np.asarray(policy(given), float).ravel(), place)
+    if not np.isfinite(action).all():
+        raise ValueError(f"the policy gives {action} {place}")
+    return action
+
+
+def _given(call: Callable[[], Any], place: str) -> Any:
     try:
-        if np.isfinite(action := np.asarray(policy(given), float).ravel()).all():
-            return action
-        why = f"gives {action}"
+        return call()
     except (Exception, SystemExit) as error:  # whatever the owner's code raises
-        why = f"fails ({type(error).__name__}: {brief(error)})"
-    raise ValueError(f"the policy {why} in step {given['step']} of episode {number + 1}")
+        raise ValueError(f"the policy fails ({type(error).__name__}: {brief(error)}) {place}") from None
 
 
 def replacement(kind: str, images: Any, rows: Sequence[np.ndarray]) -> Callable[[int, int, np.ndarray], np.ndarray]:
@@ -255,17 +261,12 @@ def ablate(policy: Policy, episodes: Episodes) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     with work("acting", 1 + len(episodes.senses) * len(KINDS), "times") as advance:
         normal, own, steps = act(policy, episodes, watch=None if episodes.images else keep)
-        again, *_ = act(policy, episodes)
         advance()
         if not episodes.images:
             episodes.images, episodes.rows = {sense: np.stack(images) for sense, images in seen.items()}, steps
         wanted = normal if episodes.actions is None else episodes.actions
         still = np.nanmax(wanted, axis=0) == np.nanmin(wanted, axis=0)
         scale = np.where(still, np.inf, np.nanstd(wanted, axis=0))
-        if again.shape != normal.shape or away(again, normal, scale).max() > SMALL:
-            raise ValueError(
-                "the policy acts differently on the same episodes: give it reset(), and seed what it draws"
-            )
         kept = [each[np.isfinite(wanted[each]).all(1)] for each in steps]
         parts = _parts(episodes.touched, kept)
         if episodes.actions is not None:
@@ -277,6 +278,9 @@ def ablate(policy: Policy, episodes: Episodes) -> dict[str, Any]:
             of = {part: _paired(worse, each) for part, each in parts.items()}
             paired = {"change": _paired(away(changed, normal, scale), kept), "error": _paired(worse, kept), "parts": of}
             rows.append({"sense": sense, "kind": kind, **paired})
+        again, *_ = act(policy, episodes)  # last: what a policy keeps adds up
+    if again.shape != normal.shape or away(again, normal, scale).max() > SAME:
+        raise ValueError("the policy acts differently on the same episodes: give it reset(), and seed what it draws")
     found = {sense: verdict(sense, [row for row in rows if row["sense"] == sense]) for sense in episodes.senses}
     about = {"episodes": len(kept), "of": episodes.of, "unit": episodes.unit, "error": _paired(own, kept)[:3]}
     return {**about, "rows": rows, "verdicts": found}

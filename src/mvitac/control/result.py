@@ -174,10 +174,8 @@ def write_page(files: Sequence[Path], out: Path) -> Path:
     if any(one != suite for one in suites) or len(set(names)) < len(names):
         raise ValueError(f"{files[-1]} is of another suite or of an encoder of the same name: make a page for each")
     head = page.head(suite.name, "mvitac bench", {"definition": suite.digest()[:12]}, suite.title)
-    sections = [
-        (f"table{number}", title, [page.table(columns, rows, words=True, label=title)])
-        for number, (title, (columns, rows)) in enumerate(tables(suite, values).items())
-    ]
+    each = enumerate(tables(suite, values).items())
+    sections = [(f"table{n}", title, [page.table(*shown, words=True, label=title)]) for n, (title, shown) in each]
     sections[0][2].insert(0, page.paragraph(note(suite, values)))
     episodes = suite_episodes(suite, next(cell for cell in suite.cells(OWN) if cell[0] == suite.kinds[2]))
     still = np.zeros(len(episodes.begin[0]().most))

@@ -162,12 +162,9 @@ class Calandra(Source):
 
     def fingerprint(self) -> dict[str, Any]:
         known = [[g.shard, g.index, g.object, g.gripping, bool(g.damage)] for g in self._grasps]
-        return {
-            "reader": f"calandra {VERSION}",
-            "files": [file.name for file in self._files],
-            "grasps": digest(known),
-            "options": {k: v for k, v in to_json(self.config).items() if k not in ("path", *KEEPING)},
-        }
+        options = {k: v for k, v in to_json(self.config).items() if k not in ("path", *KEEPING)}
+        files = [file.name for file in self._files]
+        return {"reader": f"calandra {VERSION}", "files": files, "grasps": digest(known), "options": options}
 
     def stamps(self) -> list[int]:
         numbers = {file: one_stamp([stamp]) for file, stamp in self._files.items()}

@@ -21,12 +21,8 @@ from mvitac.datasets.table.manifest import Manifest, in_clone
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.system.files import brief
 
-LABELS = {
-    "material": "MATERIALS",
-    "hardness": "HARDNESS_RANK",
-    "roughness": "ROUGHNESS_RANK",
-    "bumpiness": "TEXTURE_RANK",
-}
+LABELS = {"material": "MATERIALS", "hardness": "HARDNESS_RANK"}
+LABELS |= {"roughness": "ROUGHNESS_RANK", "bumpiness": "TEXTURE_RANK"}
 SPAN = (0.3, 0.6)  # part of a video's length that frames are from: it begins and ends without contact
 SPLIT = {"train": "TRAIN_OBJECTS", "val": "VAL_OBJECTS", "test": "TEST_OBJECTS"}
 

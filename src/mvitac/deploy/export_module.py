@@ -71,11 +71,8 @@ class ExportModule(nn.Module):
             if isinstance(q, ValueInfo)
         }
         self.inputs = {m: (model.stored, model.stored, model.spec.channels(m)) for m in self.modalities}
-        self.outputs = tuple(
-            [f"embedding_{m}" for m in self.modalities]
-            + [f"shared_{m}" for m in self.projectors]
-            + [output_of(r) for r in self.probes]  # type: ignore[arg-type]
-        )
+        names = [*(f"embedding_{m}" for m in self.modalities), *(f"shared_{m}" for m in self.projectors)]
+        self.outputs = (*names, *(output_of(r) for r in self.probes))  # type: ignore[arg-type]
         self.views = nn.ModuleDict({m: _View(model, m, for_heads=False) for m in self.modalities})
         # Heads need views of the size they were trained on.
         twice = [m for m in self.projectors if len(set(model.sides(m))) > 1]

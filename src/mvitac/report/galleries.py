@@ -62,10 +62,8 @@ def mistakes(study: Study) -> list[Markup]:
     if known:
         which = f"whose nearest row of another {by} is of another {pack.spec.tasks[0].name}"
         intro = f"{split.capitalize()} rows {which}, drawn at random (seed 0)."
-    intro += (
-        f" Left: the row. Then, best first, the nearest row of each of the {num} nearest other {by}s of any split, by"
-        f" features of the same modality ({name})."
-    )
+    intro += f" Left: the row. Then, best first, the nearest row of each of the {num} nearest other {by}s of any split,"
+    intro += f" by features of the same modality ({name})."
     return [html.paragraph(intro), html.grid(halves, "queries")]
 
 

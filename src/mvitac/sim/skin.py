@@ -76,9 +76,6 @@ class Patch:
 def draw_patch(rng: np.random.Generator) -> Patch:
     """Draw the skin under the fingers of one grip."""
     peaks = bool(rng.random() < PEAKS)
-    return Patch(
-        pattern=Pattern(rng, 2.2, 4.5),
-        peaks=peaks,
-        amplitude_mm=float(0.09 * 2.5 ** rng.uniform()),
-        friction=float((GRIPS if peaks else SLIDES) * np.exp(rng.normal(0, 0.06))),
-    )
+    pattern, amplitude = Pattern(rng, 2.2, 4.5), float(0.09 * 2.5 ** rng.uniform())
+    friction = float((GRIPS if peaks else SLIDES) * np.exp(rng.normal(0, 0.06)))
+    return Patch(pattern=pattern, peaks=peaks, amplitude_mm=amplitude, friction=friction)

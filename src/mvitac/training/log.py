@@ -86,10 +86,8 @@ class Log:
         if not self.begun:
             self.begun = True
             self._heads(columns, widths, values)
-        now, then = (
-            {n: 100 * mean(found[k] for k in keys) for n, keys in columns.items()}
-            for found in (values, self.first or values)
-        )
+        both = values, self.first or values
+        now, then = ({n: 100 * mean(found[k] for k in keys) for n, keys in columns.items()} for found in both)
         gain = mean(now[name] - then[name] for name in columns if name != RETRIEVED or len(columns) == 1)
         cells = [f"{now[name]:.1f}" for name in widths]
         self.say(_line([str(step), self.loss, self.speed], cells, f"{gain:+.1f}" if step else "", widths))

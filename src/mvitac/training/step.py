@@ -100,11 +100,9 @@ class Step:
             losses = method.contrast(all_queries | all_keys)
         found = torch.autograd.grad(losses["loss"], list(all_queries.values()), allow_unused=True)
         sizes = [len(next(iter(z.values()))) for z in queries]
-        gradients = {  # none of an embedding whose loss is not part of the sum
-            name: gradient.split(len(own[name]))[world.rank].split(sizes)
-            for name, gradient in zip(all_queries, found, strict=True)
-            if gradient is not None
-        }
+        # None of an embedding whose loss is not part of the sum.
+        given = {name: whole for name, whole in zip(all_queries, found, strict=True) if whole is not None}
+        gradients = {name: g.split(len(own[name]))[world.rank].split(sizes) for name, g in given.items()}
 
         # Second pass: embed every chunk again, and propagate the gradients of its embeddings to the parameters.
         for buffer, old in zip(statistics, before, strict=True):

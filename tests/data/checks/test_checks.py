@@ -189,6 +189,7 @@ def test_classes_that_differ_in_spelling_only(pack: Pack) -> None:
         ("1", "01", "10"): "'1' and '01'",
         ("stiff", "stifi", "x"): "",
         ("\ufb01rm", "firm", "x"): "'\\ufb01rm' and 'firm'",
+        ("wo\u200bod", "wood", "x"): "'wo\\u200bod' and 'wood'",
         ("hard wood", "hard_wood", "1.05"): "'hard wood' and 'hard_wood'",
         ("1.05", "1.5", "105"): "",
         ("1 2", "12", "-12"): "",

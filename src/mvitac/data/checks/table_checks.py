@@ -179,7 +179,8 @@ def similar_names(pack: Pack) -> Finding:
 
 
 def _key(name: str) -> str:
-    """Return ``name`` without case, Unicode variants, blanks next to letters, and leading zeros."""
+    """Return ``name`` without case, Unicode variants, invisible signs, blanks next to letters, and leading zeros."""
     text = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold())
+    text = "".join(sign for sign in text if unicodedata.category(sign) != "Cf")
     text = re.sub(r"(?<!\d)[\s_]+|[\s_]+(?!\d)", "", text)
     return re.sub(r"(?<![\d.])0+(?=\d)", "", text)
