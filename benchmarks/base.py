@@ -21,9 +21,9 @@ from mvitac.training.loop import train
 MAKES = ("gelsight", "gelsight_mini", "mini", "mini_dots", "classic", "digit")
 
 
-def base(seed: int, steps: int) -> Run:
+def base(seed: int, steps: int, num: int = 12000, sensors: int = 400) -> Run:
     """Recipe `locked` with larger images, more sensors and more steps."""
-    run = recipe("locked", MaterialsConfig(num=12000, size=96, sensors=400, makes=MAKES, sensors_per_press=2))
+    run = recipe("locked", MaterialsConfig(num=num, size=96, sensors=sensors, makes=MAKES, sensors_per_press=2))
     touch = replace(run.augment.touch, size=64, whole=96)
     return replace(
         run,
@@ -44,11 +44,13 @@ def main() -> None:
     training, writing = commands.add_parser("train"), commands.add_parser("write")
     training.add_argument("--seed", type=int, default=0)
     training.add_argument("--steps", type=int, default=4500)
+    training.add_argument("--num", type=int, default=12000, help="presses, each by two sensors")
+    training.add_argument("--sensors", type=int, default=400, help="random sensors beside the six")
     training.add_argument("--out", type=Path, default=Path("runs/base"))
     writing.add_argument("run", type=Path)
     asked = parser.parse_args()
     if asked.command == "train":
-        train(base(asked.seed, asked.steps), asked.out / f"seed{asked.seed}", resume=True)
+        train(base(asked.seed, asked.steps, asked.num, asked.sensors), asked.out / f"seed{asked.seed}", resume=True)
     else:
         # The probes are fitted on the demo's pairs: the same instances, split alike, on the four known sensors.
         publish(asked.run, BASE, MaterialsConfig().open(), half=True)

@@ -66,7 +66,7 @@ def _groups(pack: Pack) -> str:
     rows = " to ".join(map(str, dict.fromkeys((min(sizes), max(sizes)))))
     about = f"groups: {len(sizes)}, one per {pack.spec.group_by}, of {rows} row{'s' * (rows != '1')} each. "
     if max(sizes) > 1 and len(np.unique(pack.touch_groups)) == len(sizes):
-        about += "Each is one touch group, too: rows of it may be positives (--touch-group names presses). "
+        about += "Each is one touch group, too: its rows may be each other's positives. "
     leaks = "; ".join(pack.split_leaks(pack.spec.all_tasks).values())
     about += f"LEAK: {leaks}." if leaks else "A split takes whole groups, and intervals are over them."
     return fill(about, 80)

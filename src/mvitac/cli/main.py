@@ -4,6 +4,7 @@ A mistake of the user ends in one line on stderr and exit code 2, Ctrl-C in 130.
 """
 
 import importlib
+import itertools
 import os
 import re
 import shlex
@@ -130,9 +131,9 @@ def _check_choices(rest: Sequence[str], text: Path) -> None:
 
 
 def _check_outputs(words: Sequence[str]) -> None:
-    """ValueError for an output that is an input, or a file of a run, pack or export that is one."""
-    places = [re.sub(r"#.*|@[\d.]+$", "", word.rpartition("=")[2]) for word in words]
-    for at, (option, out) in enumerate(zip(words, places[1:], strict=False)):
+    """ValueError for an output that is an input, or one of the files ``OWN`` of a run, pack or export that is one."""
+    places = [re.sub(r"#.*|@[\d.]+$", "", part) for word in words for part in word.split("=")]
+    for at, (option, out) in enumerate(itertools.pairwise(places)):
         if option in ("--out", "--json", "--sheet") and os.path.isfile(out):
             inputs = [place for place in (*places[: at + 1], *places[at + 2 :]) if os.path.exists(place)]
             own = [os.path.join(place, os.path.basename(out)) for place in inputs if out.endswith(OWN)]

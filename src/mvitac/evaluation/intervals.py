@@ -84,7 +84,7 @@ def paired_difference(
 
 
 def mean_interval(values: np.ndarray) -> tuple[float, float, float, float]:
-    """Mean of ``values`` [seeds, groups], the ends of its 95 % interval over both (none of one group), two-sided p of 0."""
+    """Mean of ``values`` [seeds, groups], its 95 % interval over both (endless for one group), the p of a mean of 0."""
     if values.shape[1] < 2:
         return float(values.mean()), -math.inf, math.inf, 1.0
     sizes, mean = np.ones(values.shape[1]), float(values.mean())

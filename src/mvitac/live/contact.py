@@ -46,7 +46,7 @@ class Contact:
         self.background: np.ndarray | None = None
         self.picture: np.ndarray | None = None
         """The background float32 [side, side, 3] at the size of the model's input."""
-        self.noise = 0.0 if self.free is None else LEAST_CHANGE  # until two frames show it
+        self.noise = 0.0 if self.free is None else np.inf  # until two frames show it
         self.before: np.ndarray | None = None  # the last frame, small
         self.touched = self.uneasy = False
         self.most = self.imprint = 0.0  # the touch's largest change; what is left of the last one
@@ -74,11 +74,14 @@ class Contact:
                 return None  # something moved: calibrate again
             self.background = middle
             self.picture = np.stack(pictures).mean(0, dtype=np.float32) if pictures else None
+        noise = self.noise
         if self.free is not None:  # its own noise counts, too: learn it from the least change from frame to frame
             step = 0.0 if self.before is None else float(np.abs(small - self.before).mean()) / 2**0.5
-            self.noise, self.before = min(step or self.noise, self.noise), small
+            self.noise = min(step or np.inf, self.noise)
+            unknown = LEAST_CHANGE if self.before is None else 0.0  # all frames so far are the same
+            noise, self.before = (min(self.noise, LEAST_CHANGE) if self.noise < np.inf else unknown), small
         change = float(np.abs(small - self.background).mean())
-        threshold = max(LEAST_CHANGE, self.config.contact * self.noise)
+        threshold = max(LEAST_CHANGE, self.config.contact * noise)
         if self.touched:
             self.most = max(self.most, change)
             self.touched = change > max(threshold / 2, IMPRINT * self.most)

@@ -50,13 +50,9 @@ def draw_plan(thing: objects.Thing, patch: skin.Patch, rng: np.random.Generator)
     bottom, top = thing.heights(y)
     z = bottom + (top - bottom) * rng.uniform(0.35, 0.6)
     force = 9.81 * thing.mass / (2 * EXPECTED_FRICTION) * np.exp(rng.normal(0, 0.08))
-    return physics.Plan(
-        force_n=float(force),
-        offset_m=(float(rng.uniform(-0.003, 0.003)), float(y - middle[1]), float(z - middle[2])),
-        yaw=float(rng.normal(0, 0.07)),
-        lift_m=float(rng.uniform(0.045, 0.055)),
-        friction=patch.friction,
-    )
+    offset = float(rng.uniform(-0.003, 0.003)), float(y - middle[1]), float(z - middle[2])
+    yaw, lift = float(rng.normal(0, 0.07)), float(rng.uniform(0.045, 0.055))
+    return physics.Plan(force_n=float(force), offset_m=offset, yaw=yaw, lift_m=lift, friction=patch.friction)
 
 
 def grasp(

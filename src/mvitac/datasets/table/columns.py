@@ -114,11 +114,8 @@ def read_values(
     for name, found in columns.items():
         if len({value for value in found if value == value}) < 2:  # NaN differs from itself
             raise ValueError(f"{table.path}: column {name!r} has fewer than two different values")
-    known = [
-        [0 if any(not math.isnan(columns[t.name][i]) for t in task.targets) else -1 for i in range(len(counts))]
-        for task in tasks
-    ]
-    return columns, known
+    found = ([columns[target.name] for target in task.targets] for task in tasks)
+    return columns, [[-1 if all(map(math.isnan, row)) else 0 for row in zip(*each, strict=True)] for each in found]
 
 
 def check_names(table: Manifest, names: Iterable[str], own: Collection[str]) -> None:

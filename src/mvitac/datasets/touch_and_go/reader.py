@@ -139,10 +139,8 @@ class TouchAndGo(Source):
     def read(self, item: int) -> list[Sample | Lost]:
         chunk, lost = self._chunks[item], {}
         recording = self._recordings[chunk[0].recording]
-        images = {
-            modality: read_frames(place, [frame.number for frame in chunk], self._config.size, lost)
-            for modality, place in recording.places.items()
-        }
+        numbers = [frame.number for frame in chunk]
+        images = {m: read_frames(at, numbers, self._config.size, lost) for m, at in recording.places.items()}
         samples: list[Sample | Lost] = []
         for frame in chunk:
             if frame.number in lost:
