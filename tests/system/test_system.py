@@ -83,15 +83,15 @@ def two_threads() -> Iterator[None]:
 
 
 def test_several_at_a_time_in_order_and_the_threads_come_back(two_threads: None) -> None:
-    met = threading.Barrier(4, timeout=30)  # passes only if four run at the same time
+    met = threading.Barrier(2, timeout=30)  # passes only if two run at the same time
 
     def work(item: int) -> tuple[int, int]:
         met.wait()
-        return 36 // (item + 1), torch.get_num_threads()
+        return 36 // item, torch.get_num_threads()
 
-    assert in_threads(work, range(4)) == [(36, 1), (18, 1), (12, 1), (9, 1)]
+    assert in_threads(work, range(1, 5)) == [(36, 1), (18, 1), (12, 1), (9, 1)]
     with pytest.raises(ZeroDivisionError):
-        in_threads(work, range(-1, 3))
+        in_threads(work, range(2))
     assert torch.get_num_threads() == 2
 
 

@@ -77,13 +77,14 @@ def _at_once(calls: Sequence[Callable[[], Result]]) -> list[Result]:
     threads = torch.get_num_threads()
     share = max(1, threads // max(1, len(calls)))
     torch.set_num_threads(share)
+    others = [_pool(max(1, threads - 1), share).submit(call) for call in calls[1:]]
     try:
-        others = [_pool(max(1, threads - 1), share).submit(call) for call in calls[1:]]
         found = {0: calls[0]()} if calls else {}
         # What no thread has begun is done here: never more calls at once than threads, as each may need much memory.
         found |= {i: calls[i]() for i in range(len(others), 0, -1) if others[i - 1].cancel()}
         return [found[i] if i in found else others[i - 1].result() for i in range(len(calls))]
     finally:
+        _ = [other.cancel() for other in others]  # after an error nothing more is begun
         torch.set_num_threads(threads)
 
 
