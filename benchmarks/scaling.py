@@ -46,7 +46,7 @@ def main() -> None:
         step = Step(run, method.train(), device, size)  # type: ignore[arg-type]
         variants[name] = lambda step=step: step([lambda: batch], lr=1e-3, seed=0, progress=0.5)
     seconds = interleave(variants, options.rounds, device)
-    if world.writes:
+    if world.is_main:
         print(
             f"{world.size} processes, {options.batch} pairs each:"
             f" a step takes {seconds['together'] / seconds['alone']:.2f} times as long as alone"

@@ -273,7 +273,7 @@ def with_cudnn(call: Callable[..., object], **flags: bool) -> Callable[..., obje
 
 def feed(run: Run, pack: Pack, device: torch.device) -> Any:
     """Yield the chunks of one step after another, as the training loop does, without end."""
-    return StepViews(run, pack, 2, device).each(Batches(run, pack, pack.rows("train")), 0, 10**9)
+    return StepViews(run, pack, 2, device).iterate(Batches(run, pack, pack.rows("train")), 0, 10**9)
 
 
 def measure_whole(scale: Scale, folder: Path, pack: Pack, device: torch.device, workers: int) -> dict[str, Any]:

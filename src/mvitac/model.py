@@ -72,17 +72,17 @@ class Model(nn.Module):
     def seed(self) -> int:
         return self.run.seed
 
-    def sides(self, modality: str) -> tuple[int, int]:
+    def image_sizes(self, modality: str) -> tuple[int, int]:
         """Sides in pixels of the images that probes, and heads trained along, see."""
         return self.run.augment.whole_of(modality), self.run.augment.size_of(modality)
 
-    def levels(self, modality: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    def mean_std(self, modality: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Mean and standard deviation, of R, G and B in [0, 1], by which images are normalised."""
-        return self.run.encoder[modality].levels
+        return self.run.encoder[modality].mean_std
 
     def input(self, modality: str, images: Tensor, *, for_heads: bool = False) -> Tensor:
         """The normalised images [B, C, S, S] that an encoder takes, of uint8 or floats in [0, 1], with their gradients."""
-        return encoder_input(images, self.sides(modality)[for_heads], self.levels(modality))
+        return encoder_input(images, self.image_sizes(modality)[for_heads], self.mean_std(modality))
 
     def __repr__(self) -> str:
         widths = ", ".join(f"{modality} {num_features(trunk)}" for modality, trunk in self.encoders.items())
@@ -147,10 +147,10 @@ class Model(nn.Module):
         """
         self.check_modality(modality)
         self._check_background(modality, background)
-        channels, size = self.spec.channels(modality), self.sides(modality)[0] if normalize else None
+        channels, size = self.spec.channels(modality), self.image_sizes(modality)[0] if normalize else None
         frames = self.spec.frames(modality)
         free = None if background is None else to_array(background, channels // frames, "background")
-        return Preprocess(modality, channels, self.stored, size, free, frames, self.levels(modality))
+        return Preprocess(modality, channels, self.stored, size, free, frames, self.mean_std(modality))
 
     def trunk(self, modality: str) -> nn.Module:
         """A copy of one encoder as a plain timm model, from normalised images [B, C, S, S] to features [B, D].
@@ -159,9 +159,9 @@ class Model(nn.Module):
         ValueError if the model has no such encoder, or it is not a single timm model.
         """
         self.check_modality(modality)
-        channels, size, trunk = self.spec.channels(modality), self.sides(modality)[0], self.run.encoder[modality].trunk
-        mean, std = (values * (channels // 3) for values in self.levels(modality))
-        return timm_trunk(self.encoders[modality], trunk, (channels, size, size), mean, std)
+        channels, size = self.spec.channels(modality), self.image_sizes(modality)[0]
+        mean, std = (values * (channels // 3) for values in self.mean_std(modality))
+        return timm_trunk(self.encoders[modality], self.run.encoder[modality].trunk, (channels, size, size), mean, std)
 
     @torch.no_grad()
     def features(self, modality: str, images: Tensor, *, for_heads: bool = False, bf16: bool = False) -> Tensor:
@@ -291,12 +291,13 @@ class Model(nn.Module):
 
     def weights_digest(self) -> str:
         """Content address of the weights and of the image size they expect, for caches."""
-        return digest([safetensors_digest(tensors_of(self)), *dict.fromkeys(self.sides(m)[0] for m in self.encoders)])
+        sizes = dict.fromkeys(self.image_sizes(m)[0] for m in self.encoders)
+        return digest([safetensors_digest(tensors_of(self)), *sizes])
 
     def features_key(self, modality: str) -> str:
         """Content address of what the features of ``modality`` depend on. Models that share a tower share it."""
         encoder = self.run.encoder[modality]
-        kind = encoder.trunk, encoder.temporal, self.levels(modality), self.sides(modality)[0], self.stored
+        kind = encoder.trunk, encoder.temporal, self.mean_std(modality), self.image_sizes(modality)[0], self.stored
         return digest([safetensors_digest(tensors_of(self.encoders[modality])), *kind])
 
     def save(self, path: Path, *, half: bool = False) -> None:

@@ -21,7 +21,7 @@ from mvitac.model import load
 from mvitac.nn.encoders import EncoderConfig, PerFrame, build_trunk
 from mvitac.recipes import recipe
 from mvitac.training.loop import train
-from mvitac.training.sampler import partners
+from mvitac.training.sampler import draw_positives
 from mvitac.transforms.random_views import Augment
 from support.training_runs import assert_equal_weights, power_cut
 
@@ -160,13 +160,13 @@ def test_per_frame_features_are_averaged() -> None:
 
 def test_positives_can_be_near_in_time(presses: Pack, tmp_path: Path) -> None:
     rows = np.repeat(np.arange(presses.num), 30)
-    found = partners(presses, rows, torch.Generator().manual_seed(0), within=2)
+    found = draw_positives(presses, rows, torch.Generator().manual_seed(0), within=2)
     away = (presses.column("frame")[found] - presses.column("frame")[rows]).astype(int)
     assert np.array_equal(presses.touch_groups[found], presses.touch_groups[rows])
     first = presses.column("frame")[rows] == 0
     assert set(away[first].tolist()) == {1, 2} and set(away.tolist()) == {-2, -1, 1, 2}
-    assert (np.abs(partners(presses, rows, torch.Generator().manual_seed(0)) - rows) > 0).all()
-    alone = partners(presses, rows, torch.Generator().manual_seed(0), within=0.5)
+    assert (np.abs(draw_positives(presses, rows, torch.Generator().manual_seed(0)) - rows) > 0).all()
+    alone = draw_positives(presses, rows, torch.Generator().manual_seed(0), within=0.5)
     assert np.array_equal(alone, rows)  # no frame is as near
 
     run = recipe("smoke", PackConfig(path=presses.path, num_frames=2))

@@ -21,7 +21,7 @@ from mvitac.evaluation.probe import split_rows
 from mvitac.model import Model, load
 from mvitac.recipes import recipe
 from mvitac.training.loop import train
-from mvitac.training.sampler import partners
+from mvitac.training.sampler import draw_positives
 from mvitac.training.views import StepViews
 from support.toy import Holes, Toy
 
@@ -67,7 +67,7 @@ def test_training_sees_whole_pairs_only(holes: Pack, tmp_path: Path, monkeypatch
     assert whole[seen].all()
     assert set(seen) <= set(holes.rows("train", "unlabelled"))
 
-    found = partners(holes, np.array(seen), torch.Generator().manual_seed(0))
+    found = draw_positives(holes, np.array(seen), torch.Generator().manual_seed(0))
     assert whole[found].all()
 
 

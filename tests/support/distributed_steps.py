@@ -71,8 +71,8 @@ def three_steps(
     result = {"losses": step(parts, lr=5e-3, seed=0, progress=0.5), "gradients": gradients(method)}
     result["memory"] = {k: v.clone() for k, v in method.state_dict().items() if k.startswith(("banks.", "z_norm"))}
     step(parts, lr=5e-3, seed=1, progress=0.5)
-    if world is None or world.writes:
-        checkpoint.save(to, run, method, step.optimiser, 2)
+    if world is None or world.is_main:
+        checkpoint.save(to, run, method, step.optimiser, 2, {})
     result["last"] = step(parts, lr=5e-3, seed=2, progress=0.5)
     return {**result, "weights": method.state_dict()}
 

@@ -17,7 +17,7 @@ from mvitac.datasets.pack import PackConfig
 from mvitac.methods.base import Views
 from mvitac.recipes import recipe
 from mvitac.run import Run
-from mvitac.training.loader import Feed
+from mvitac.training.loader import ImageLoader
 from mvitac.training.loop import Interrupted, train
 from mvitac.training.sampler import Batches
 from mvitac.training.views import StepViews
@@ -50,10 +50,10 @@ def batches(run: Run, pack: Pack, rows: np.ndarray, start: int, num_steps: int) 
     return [order[step] for step in range(start, num_steps)]
 
 
-def views_by(feed: type[Feed], run: Run, pack: Pack, rows: np.ndarray, num_views: int = 2) -> Views:
+def views_by(feed: type[ImageLoader], run: Run, pack: Pack, rows: np.ndarray, num_views: int = 2) -> Views:
     """Views of ``rows`` on the CPU, with images from ``feed``."""
     made = StepViews(run, pack, num_views, torch.device("cpu"))
-    made.feed = feed(pack, made.device)
+    made.images = feed(pack, made.device)
     return made.make(rows, 0)
 
 

@@ -27,9 +27,9 @@ from mvitac.recipes import recipe
 from mvitac.run import Optim, Run
 from mvitac.system import files
 from mvitac.training.checkpoint import CHECKPOINT, PREVIOUS
-from mvitac.training.loader import Feed
+from mvitac.training.loader import ImageLoader
 from mvitac.training.loop import Diverged, train
-from mvitac.training.sampler import epoch_order, mix, partners
+from mvitac.training.sampler import combine_seeds, draw_positives, epoch_order
 from mvitac.training.validation import validate
 from mvitac.transforms.random_views import Augment
 from support.processes import begin, finish
@@ -248,18 +248,18 @@ def test_spread_has_no_tail_of_duplicates() -> None:
 
 def test_the_spread_sampler_spreads(pack: Pack) -> None:
     run, rows = smoke(pack, sampler="spread"), pack.rows("train")
-    order = epoch_order(len(rows), pack.touch_groups[rows], mix(run.seed, 1, 0), spread=True)
+    order = epoch_order(len(rows), pack.touch_groups[rows], combine_seeds(run.seed, 1, 0), spread=True)
     per_epoch = run.steps_per_epoch(len(rows))
     found = np.concatenate(list(batches(run, pack, rows, 0, per_epoch)))
     assert np.array_equal(found, rows[order[: len(found)]])
 
 
-def test_partners_are_other_rows_of_the_same_touch(pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_positives_are_other_rows_of_the_same_touch(pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
     rows, groups = np.arange(pack.num), pack.touch_groups
-    found = partners(pack, rows, torch.Generator().manual_seed(0))
+    found = draw_positives(pack, rows, torch.Generator().manual_seed(0))
     assert (found != rows).all()  # every toy instance has two rows
     assert np.array_equal(groups[found], groups[rows])
-    assert np.array_equal(found, partners(pack, rows, torch.Generator().manual_seed(0)))
+    assert np.array_equal(found, draw_positives(pack, rows, torch.Generator().manual_seed(0)))
     real = Pack.column
 
     def halved(self: Pack, name: str) -> np.ndarray:
@@ -270,14 +270,14 @@ def test_partners_are_other_rows_of_the_same_touch(pack: Pack, monkeypatch: pyte
 
     monkeypatch.setattr(Pack, "column", halved)
     rows = np.flatnonzero(real(pack, "split") != "test")  # those already in test keep their partner there
-    assert np.array_equal(partners(pack, rows, torch.Generator().manual_seed(0)), rows)
+    assert np.array_equal(draw_positives(pack, rows, torch.Generator().manual_seed(0)), rows)
 
 
 def asked(run: Run, pack: Pack, rows: np.ndarray, num: int = 2) -> tuple[list[int], dict[str, list[np.ndarray]]]:
     """How many views there are of vision and of touch for ``rows``, and the rows that the feed is asked for."""
     seen: dict[str, list[np.ndarray]] = {"vision": [], "touch": []}
 
-    class Spy(Feed):
+    class Spy(ImageLoader):
         def __call__(self, modality: str, rows: np.ndarray) -> torch.Tensor:
             seen[modality].append(rows)
             return super().__call__(modality, rows)

@@ -18,7 +18,7 @@ from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.nn.losses import info_nce
 from mvitac.recipes import with_method
-from mvitac.training.loader import Feed
+from mvitac.training.loader import ImageLoader
 from mvitac.training.loop import train
 from support.mixes import Gel, Slice, built, mix_run
 from support.small_methods import build, small
@@ -84,12 +84,12 @@ def test_views_are_of_the_rows_that_have_the_modality(parts: dict[str, str]) -> 
     run = mix_run(parts["a"], parts["gel"], positives="same-touch")
     pack = run.data.open()
     rows = np.array([*pack.rows("train")[[2, 0]], *pack.rows("train")[-3:], pack.rows("train")[4]])
-    made = views_by(Feed, run, pack, rows)
+    made = views_by(ImageLoader, run, pack, rows)
     assert {m: [len(view) for view in found] for m, found in made.images.items()} == {"vision": [3, 3], "touch": [6, 6]}
     assert {m: found.tolist() for m, found in made.both.items()} == {"vision": [0, 1, 2], "touch": [0, 1, 5]}
-    few = views_by(Feed, run, pack, rows[:5][[0, 2, 3, 4]])  # a single camera image has no negative
+    few = views_by(ImageLoader, run, pack, rows[:5][[0, 2, 3, 4]])  # a single camera image has no negative
     assert few.images.keys() == {"touch"} and not few.both
-    whole = views_by(Feed, run, pack, rows[:2])
+    whole = views_by(ImageLoader, run, pack, rows[:2])
     assert whole.images.keys() == {"vision", "touch"} and not whole.both
 
 

@@ -99,7 +99,7 @@ def describe(models: Sequence[Model], places: Sequence[str], about: About) -> di
     return {
         **found,
         **given,
-        "size": max(model.sides(m)[0] for m in model.encoders),
+        "size": max(model.image_sizes(m)[0] for m in model.encoders),
         "seeds": seeds,
         "weights": weights,
         "parameters": {m: sum(p.numel() for p in trunk.parameters()) for m, trunk in model.encoders.items()},

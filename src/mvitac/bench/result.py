@@ -41,7 +41,7 @@ GUESS = "majority or mean"  # what the page calls these two controls
 MAX_NAME = 200
 
 
-def kept(record: dict[str, Any]) -> dict[str, Any]:
+def stored(record: dict[str, Any]) -> dict[str, Any]:
     """What a result keeps of a probe's record: sums per test group, of values in ten digits."""
     about = {name: record[name] for name in (*KEY, "clipped") if name in record}
     if "group_sums" not in record:

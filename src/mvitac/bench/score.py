@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mvitac.bench.external import ExternalModel, open_model
-from mvitac.bench.result import kept
+from mvitac.bench.result import stored
 from mvitac.bench.suite import Opened, Suite, SuiteSet, SuiteTask, open_set
 from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Images, Pack
@@ -181,7 +181,7 @@ def trunks(suite: Any) -> list[tuple[str, ExternalModel]]:
 
 
 def _scores(readers: Sequence[Reader], opened: Opened, suite: Suite, ask: SuiteTask, task: AnyTask) -> Records:
-    return [kept(record) for reader in readers for record in reader.score(suite, ask, task, "", suite.probes)]
+    return [stored(record) for reader in readers for record in reader.score(suite, ask, task, "", suite.probes)]
 
 
 def _controls(readers: Sequence[Reader], opened: Opened, suite: Suite, ask: SuiteTask, task: AnyTask) -> Records:
@@ -189,7 +189,7 @@ def _controls(readers: Sequence[Reader], opened: Opened, suite: Suite, ask: Suit
     each = [label_controls(view, [task]) + pixel_controls(view, [task], ask.modalities) for view in opened.packs]
     found = [r for reader in readers for r in reader.score(suite, ask, task, reader.name, ["linear"])]
     found = [{**r, "seed": None} if r["source"] == "imagenet" else r for r in found]
-    return [kept(record) for record in (*(pool(each) if len(each) > 1 else each[0]), *found)]
+    return [stored(record) for record in (*(pool(each) if len(each) > 1 else each[0]), *found)]
 
 
 def _block(

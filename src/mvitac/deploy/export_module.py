@@ -29,8 +29,8 @@ class _View(nn.Module):
 
     def __init__(self, model: Model, modality: str, for_heads: bool) -> None:
         super().__init__()
-        mean, std = (torch.tensor(v).view(3, 1, 1) for v in model.run.encoder[modality].levels)
-        self.register_buffer("filter", _filter(model.sides(modality)[for_heads], model.stored))
+        mean, std = (torch.tensor(v).view(3, 1, 1) for v in model.run.encoder[modality].mean_std)
+        self.register_buffer("filter", _filter(model.image_sizes(modality)[for_heads], model.stored))
         self.register_buffer("scale", 1 / (255 * std))
         self.register_buffer("shift", -mean / std)
 
@@ -75,7 +75,7 @@ class ExportModule(nn.Module):
         self.outputs = (*names, *(output_of(r) for r in self.probes))  # type: ignore[arg-type]
         self.views = nn.ModuleDict({m: _View(model, m, for_heads=False) for m in self.modalities})
         # Heads need views of the size they were trained on.
-        twice = [m for m in self.projectors if len(set(model.sides(m))) > 1]
+        twice = [m for m in self.projectors if len(set(model.image_sizes(m))) > 1]
         self.head_views = nn.ModuleDict({m: _View(model, m, for_heads=True) for m in twice})
         if looks:
             mixing = [looks.source.mixtures @ target.colours.T for target in looks.targets]

@@ -28,12 +28,12 @@ EPOCHS, BATCH, DROPOUT = 60, 256, 0.2  # training settings of the paper's probe 
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Fit with one thread of BLAS and OpenMP, without scikit-learn's warnings that 300 steps are few: they choose C.
+    """Fit with one thread of BLAS, without scikit-learn's warnings that 300 steps are few: they choose C.
 
-    The products are small, and waiting threads made logistic regression ten times slower. Several fits may run at once in
-    threads. Both settings are the process's, so whoever starts the threads enters this first.
+    Their products are small: waiting threads made logistic regression ten times slower. Several fits may run at once in
+    threads, which torch counts by OpenMP: it has no limit. Both settings are the process's: who starts threads enters first.
     """
-    with warnings.catch_warnings(), _THREADPOOLS().limit(limits=1):
+    with warnings.catch_warnings(), _THREADPOOLS().limit(limits=1, user_api="blas"):
         warnings.simplefilter("ignore", ConvergenceWarning)
         yield
 

@@ -69,7 +69,7 @@ def probe_encoders(
 
 def about_lines(described: Sequence[dict[str, Any]]) -> list[str]:
     """What stands below a table about its encoders (``ExternalModel.describe``): licence, parameters, training data."""
-    senses: dict[str, list[str]] = {}
+    modalities: dict[str, list[str]] = {}
     for model in described:
         for modality, encoder in model["encoders"].items():
             use = ", no commercial use" if encoder["noncommercial"] else ""
@@ -77,6 +77,6 @@ def about_lines(described: Sequence[dict[str, Any]]) -> list[str]:
                 f"{encoder['title']}: {encoder['parameters'] / 1e6:.3g} M parameters; licence {encoder['licence']}{use};"
                 f" trained on {encoder['trained_on']}; {encoder['source']}; {encoder['features']} features of"
             )
-            senses.setdefault(line, []).append(modality)
-    lines = [f"{line} {' and '.join(dict.fromkeys(found))}" for line, found in senses.items()]
+            modalities.setdefault(line, []).append(modality)
+    lines = [f"{line} {' and '.join(dict.fromkeys(found))}" for line, found in modalities.items()]
     return [*lines, *dict.fromkeys(f"{model['title']}: {note}" for model in described for note in model["notes"])]

@@ -63,7 +63,7 @@ def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_h
 
 
 def _place(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool) -> Path:
-    whole, heads = model.sides(modality)  # the key covers the first
+    whole, heads = model.image_sizes(modality)  # the key covers the first
     kind = [heads] if for_heads and heads != whole else []
     device = next(model.parameters()).device.type
     key = digest([model.features_key(modality), pack.digest, modality, digest(rows.tolist()), device, *kind])

@@ -153,7 +153,7 @@ def _start(ancestor: Path, data: DatasetConfig, pack: Pack) -> tuple[Model, Init
 
 def _run_of(model: Model, init: Init, data: DatasetConfig, pack: Pack, method: SupervisedConfig) -> Run:
     """Fine-tuning with all labels: light views at the size at which the frozen features are probed."""
-    sides = {m: min(model.sides(m)[0], pack.size) for m in model.encoders}
+    sides = {m: min(model.image_sizes(m)[0], pack.size) for m in model.encoders}
     start = model.run.fresh() if init else model.run
     run = replace(start, recipe="finetune", data=data, method=method, optim=OPTIM, precision="auto")
     run = replace(run, init=replace(init, modalities=method.modalities).resolved() if init else init)

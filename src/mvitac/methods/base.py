@@ -199,10 +199,10 @@ class MethodConfig(Registered, ABC):
         rows = pack.rows("train", "unlabelled")
         rows = rows[pack.whole[rows]]
         if not self.takes_missing:
-            self.check_senses(pack, rows, pack.spec.modalities)
+            self.check_complete(pack, rows, pack.spec.modalities)
         return rows
 
-    def check_senses(self, pack: Pack, rows: np.ndarray, modalities: tuple[str, ...]) -> None:
+    def check_complete(self, pack: Pack, rows: np.ndarray, modalities: tuple[str, ...]) -> None:
         """Raise ValueError unless all of ``rows`` have all of ``modalities``."""
         for modality in modalities:
             lacking = rows[~pack.has(modality)[rows]]

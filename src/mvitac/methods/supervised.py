@@ -40,7 +40,7 @@ class LabelledConfig(MethodConfig):
         modalities = self.modalities_of(pack.spec)
         known = {task.name: pack.answered(task, *self.label_splits) for task in self.tasks_of(pack.spec)}
         labelled = np.any(list(known.values()), axis=0)
-        self.check_senses(pack, np.flatnonzero(pack.whole & labelled), modalities)
+        self.check_complete(pack, np.flatnonzero(pack.whole & labelled), modalities)
         seen = np.all([pack.has(m) for m in modalities], axis=0)
         for task, there in known.items():
             if not there[seen].any():

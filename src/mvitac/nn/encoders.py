@@ -117,7 +117,7 @@ class EncoderConfig:
             raise ValueError(f"unknown trunk {self.trunk!r}: give the name of a timm model, e.g. resnet18{hint}")
 
     @property
-    def levels(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    def mean_std(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Mean and standard deviation by which the trunk's images are normalised: those of timm's weights for it."""
         known = timm.get_pretrained_cfg(self.trunk)
         return (known.mean, known.std) if known else (IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD)

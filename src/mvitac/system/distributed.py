@@ -24,7 +24,7 @@ class World:
     size: int = 1
 
     @property
-    def writes(self) -> bool:
+    def is_main(self) -> bool:
         """Whether this process writes files and shows progress (rank 0)."""
         return self.rank == 0
 
@@ -46,13 +46,13 @@ class World:
         for gradient, summed in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
             gradient.copy_(summed.view_as(gradient))
 
-    def same_everywhere(self, tensors: list[Tensor]) -> None:
+    def broadcast(self, tensors: list[Tensor]) -> None:
         """Overwrite ``tensors`` with those of rank 0."""
         if self.size > 1:
             for tensor in tensors:
                 dist.broadcast(tensor, 0)
 
-    def anyone(self, flag: bool) -> bool:
+    def any(self, flag: bool) -> bool:
         """Return whether ``flag`` is true on any process; all processes must call this."""
         if self.size == 1:
             return flag
@@ -60,7 +60,7 @@ class World:
         dist.all_reduce(value)
         return bool(value > 0)
 
-    def wait(self) -> None:
+    def barrier(self) -> None:
         """Wait until all processes have called this."""
         if self.size > 1:
             dist.barrier()

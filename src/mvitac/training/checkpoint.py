@@ -25,15 +25,15 @@ CHECKPOINT, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
 
 
 def save(
-    out: Path, run: Run, method: Method, optimiser: torch.optim.Optimizer, step: int, kept: dict[str, Any] | None = None
+    out: Path, run: Run, method: Method, optimiser: torch.optim.Optimizer, step: int, validation: dict[str, Any]
 ) -> None:
     """Write the state after ``step`` steps to checkpoint.pt in the run's folder ``out``, and keep the one before it.
 
-    ``kept`` is the state of validation (tensors and numbers).
+    ``validation`` is its state (tensors and numbers).
     """
     state = {"method": method.state_dict(), "optimiser": optimiser.state_dict(), "step": step}
     buffer = io.BytesIO()  # torch.save to a file would hide the error of a full disk
-    torch.save({**state, "run": run.digest(), "kept": kept or {}}, buffer)
+    torch.save({**state, "run": run.digest(), "validation": validation}, buffer)
 
     def write(file: Any) -> None:
         file.write(buffer.getbuffer())
@@ -66,10 +66,10 @@ def restore(
             raise ValueError(f"{path} belongs to another run: restore the one of this run, or delete it to start over")
         method.load_state_dict(state["method"])
         optimiser.load_state_dict(state["optimiser"])
-        if damage and (world is None or world.writes):
+        if damage and (world is None or world.is_main):
             print(f"mvitac: {damage}; continuing from {path}, step {state['step']}", file=sys.stderr)
             (out / CHECKPOINT).unlink()  # else the next checkpoint would push it to the place of the good one
-        return state["step"], state["kept"]
+        return state["step"], state.get("validation", {})
     if damage:
         raise ValueError(f"{damage}: delete it{f' and {PREVIOUS}' if len(found) > 1 else ''} to start over")
     return 0, {}

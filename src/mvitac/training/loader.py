@@ -17,7 +17,7 @@ from mvitac.system.prefetch import prefetch
 SHARE = 0.4  # share of the free GPU memory that a copy of the pack may take
 
 
-class Feed:
+class ImageLoader:
     """Returns images of a pack on a device.
 
     On a GPU the whole pack is kept in GPU memory if it fits (JPEGs are decoded). Otherwise images are copied through pinned
@@ -49,7 +49,7 @@ class Feed:
         return images.to(self.device).permute(0, 3, 1, 2)
 
 
-def ahead(batches: Iterator[Views], device: torch.device) -> Iterator[Views]:
+def prefetch_cuda(batches: Iterator[Views], device: torch.device) -> Iterator[Views]:
     """Prepare ``batches`` in a thread on a CUDA stream of their own, so that the network does not wait for its input."""
     side = torch.cuda.Stream(device)
 

@@ -21,7 +21,7 @@ from mvitac.system.distributed import join
 from mvitac.system.locks import hold_lock
 from mvitac.training import checkpoint
 from mvitac.training.log import EARLY, Log, Logger
-from mvitac.training.sampler import Batches, mix
+from mvitac.training.sampler import Batches, combine_seeds
 from mvitac.training.setup import Setup, check_out, set_up
 from mvitac.training.validation import Validation
 
@@ -76,7 +76,7 @@ def train(
     check_out(out, resume)
     world = join()
     busy = f"{out} is being trained by another process: wait, or choose another --out"
-    with hold_lock(out, busy, wait=False) if world.writes else nullcontext():
+    with hold_lock(out, busy, wait=False) if world.is_main else nullcontext():
         setup = set_up(run, out, world, quiet=quiet, pack=pack)
         if setup is not None:  # else the run is already finished
             _loop(setup, out, quiet=quiet, loggers=loggers, validate=validate)
@@ -85,13 +85,13 @@ def train(
 
 def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], validate: bool) -> None:
     run, pack, world, method, step = setup.run, setup.pack, setup.world, setup.method, setup.step
-    start, rows = setup.start, len(setup.rows)
+    start, rows = setup.steps_done, len(setup.rows)
     num_steps, steps_per_epoch = run.num_steps(rows), run.steps_per_epoch(rows)
     save_every = run.checkpoint_every or max(MIN_BETWEEN_CHECKPOINTS, num_steps // 10)
-    batches = setup.views.each(Batches(run, pack, setup.rows), start, num_steps)
+    batches = setup.views.iterate(Batches(run, pack, setup.rows), start, num_steps)
 
     # Only rank 0 logs and evaluates; on the other processes ``log`` is None.
-    made = Log(out, run, pack, start, num_steps, quiet=quiet, loggers=loggers) if world.writes else None
+    made = Log(out, run, pack, start, num_steps, quiet=quiet, loggers=loggers) if world.is_main else None
     with made or nullcontext() as log, _stop_signals() as stop_requested:
         if log and not quiet:
             log.say(setup.hardware.sentence)
@@ -105,10 +105,10 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
 
             # One optimiser step. The seed of dropout and the learning rate depend on the step number alone.
             lr = run.optim.rate(at, num_steps, at // steps_per_epoch)
-            losses = step(chunks, lr=lr, seed=mix(run.seed, at) + 1, progress=done / num_steps)
+            losses = step(chunks, lr=lr, seed=combine_seeds(run.seed, at) + 1, progress=done / num_steps)
 
-            # Log the losses and check that they are finite. This waits for the GPU, as only saves and evaluations do
-            # besides, so it is done every log_every steps, and once early, so that the speed is known soon.
+            # Log the losses and check that they are finite, every log_every steps, as reading them waits for the GPU; and
+            # once early, so that the speed is known soon.
             early = done - start == EARLY < run.log_every
             report = done % run.log_every == 0 or last or early
             if report:
@@ -118,7 +118,7 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
                     log.step(done, values, lr)
 
             # Stop after Ctrl-C or SIGTERM. Several processes must agree on the step, and ask each other when they report.
-            stop = stop_requested() if world.size == 1 else report and world.anyone(stop_requested())
+            stop = stop_requested() if world.size == 1 else report and world.any(stop_requested())
             save = last or done % save_every == 0 or stop
             evaluate = last or (run.eval_every > 0 and done % run.eval_every == 0)
             if save or evaluate:
@@ -131,16 +131,16 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
                     validation(done, last=last)
 
             # Save a checkpoint.
-            if save and world.writes:
+            if save and world.is_main:
                 _check_still_there(out)
-                checkpoint.save(out, run, method, step.optimiser, done, kept=setup.kept)
+                checkpoint.save(out, run, method, step.optimiser, done, setup.validation_state)
             if stop and not last:
                 raise Interrupted(f"stopped after step {done} of {num_steps}; {out} continues with resume")
-    if world.writes:
+    if world.is_main:
         Model(method, run, setup.spec, pack.size).save(out / "model.safetensors")
         _check_still_there(out)
         (out / checkpoint.PREVIOUS).unlink(missing_ok=True)
-    world.wait()
+    world.barrier()
 
 
 def _check_still_there(out: Path) -> None:

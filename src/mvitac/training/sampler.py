@@ -16,7 +16,7 @@ Order = Callable[[int, np.ndarray | None, int], np.ndarray]
 """(number of rows, their touch groups, seed) -> an order of the rows."""
 
 
-def mix(*numbers: int) -> int:
+def combine_seeds(*numbers: int) -> int:
     """Combine several numbers into one 63-bit seed, by numpy's SeedSequence."""
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> 1)
 
@@ -36,7 +36,7 @@ class Batches:
         return self._epoch(step // self.shape[0])[step % self.shape[0]]
 
     def _pass(self, epoch: int) -> np.ndarray:
-        order = self.order(len(self.rows), self.touch_groups, mix(self.seed, 1, epoch))
+        order = self.order(len(self.rows), self.touch_groups, combine_seeds(self.seed, 1, epoch))
         return self.rows[order[: self.shape[0] * self.shape[1]]].reshape(self.shape)
 
 
@@ -61,17 +61,17 @@ class PartOrder:
     def epoch(self, number: int) -> np.ndarray:
         """Rows [per_epoch, batch_size] of epoch ``number``."""
         for earlier in range(len(self.before) - 1, number + 1):
-            counts = np.random.default_rng(mix(self.seed, 2, earlier)).multinomial(self.num, self.shares)
+            counts = np.random.default_rng(combine_seeds(self.seed, 2, earlier)).multinomial(self.num, self.shares)
             self.before.append(self.before[-1] + counts)
         first, last = self.before[number : number + 2]
         parts = np.repeat(np.arange(len(self.rows)), last - first)
-        parts = np.random.default_rng(mix(self.seed, 3, number)).permutation(parts)
+        parts = np.random.default_rng(combine_seeds(self.seed, 3, number)).permutation(parts)
         drawn = np.empty(self.num, np.int64)
         for part in np.unique(parts).tolist():
             drawn[parts == part] = self._sequence(part, int(first[part]), int(last[part]))
-        return self._apart(drawn.reshape(self.shape))
+        return self._separate_repeats(drawn.reshape(self.shape))
 
-    def _apart(self, drawn: np.ndarray) -> np.ndarray:
+    def _separate_repeats(self, drawn: np.ndarray) -> np.ndarray:
         """Exchange what a batch holds twice, where a pass ends, for a row of the same part in the nearest batch."""
         for number, batch in enumerate(drawn):
             for place in np.setdiff1d(np.arange(len(batch)), np.unique(batch, return_index=True)[1]):
@@ -86,7 +86,7 @@ class PartOrder:
         """Rows ``start`` to ``end`` of the endless sequence of ``part``."""
         rows, groups = self.rows[part], self.touch_groups[part]
         passes = range(start // len(rows), -(-end // len(rows)))
-        orders = [rows[self.order(len(rows), groups, mix(self.seed, 4, part, number))] for number in passes]
+        orders = [rows[self.order(len(rows), groups, combine_seeds(self.seed, 4, part, number))] for number in passes]
         skipped = passes.start * len(rows)
         return np.concatenate(orders)[start - skipped : end - skipped]
 
@@ -102,8 +102,8 @@ def check_mix(run: Run, pack: Pack, rows: np.ndarray, world: World) -> None:
         if size < share * run.batch_size - 1e-6:
             asked = f"{share * run.batch_size:.0f} of a batch of {run.batch_size}"
             raise ValueError(f"part {name} has {size} rows to train on, for {asked}: a row would be its own negative")
-    senses = np.stack([pack.has(modality)[rows] for modality in pack.spec.modalities])
-    if (senses == senses[:, :1]).all():
+    present = np.stack([pack.has(modality)[rows] for modality in pack.spec.modalities])
+    if (present == present[:, :1]).all():
         return
     if world.size > 1 or run.chunk:
         raise ValueError("parts that lack a modality support neither several processes nor --chunk: leave them out")
@@ -133,7 +133,7 @@ def epoch_order(num: int, groups: np.ndarray | None, seed: int, *, spread: bool 
     return order[np.argsort((occurrence + start[inverse] + jitter) / counts[inverse] % 1)]
 
 
-def partners(
+def draw_positives(
     pack: Pack, rows: np.ndarray, generator: torch.Generator, *, within: float = 0.0, other_sensor: bool = False
 ) -> np.ndarray:
     """For each of ``rows`` a random other row of the same touch group and split, else the row itself.

@@ -52,8 +52,8 @@ class Setup:
     method: Method
     views: StepViews
     step: Step
-    start: int  # number of steps that are already done
-    kept: dict[str, Any]  # state of validation (``Validation``)
+    steps_done: int  # by the checkpoint
+    validation_state: dict[str, Any]  # of ``Validation``
     spec: DataSpec  # that of ``pack``, with the sensors that the model met
 
 
@@ -72,16 +72,16 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     start = read_start(run.init)
     method, taken = _build_method(run, pack, rows, device, start)
     step = Step(run, method, device, world)
-    done, kept = checkpoint.restore(out, run, method, step.optimiser, world)
-    with nullcontext() if quiet or not world.writes else shown():
+    done, validation = checkpoint.restore(out, run, method, step.optimiser, world)
+    with nullcontext() if quiet or not world.is_main else shown():
         locked = _locked_features(run, pack, method, world)
     views = StepViews(run, pack, method.views, device, world, locked)
     before = start.sensors if start and "touch" in taken["taken"] else ()
     spec = replace(pack.spec, sensors=tuple(sorted({*sensors_of(pack, rows), *before})))
-    setup = Setup(run, pack, rows, hardware, world, method, views, step, done, kept, spec)
-    world.same_everywhere([*method.parameters(), *method.buffers()])
-    world.wait()  # rank 0 writes run.json only after all processes have looked for it
-    if world.writes:
+    setup = Setup(run, pack, rows, hardware, world, method, views, step, done, validation, spec)
+    world.broadcast([*method.parameters(), *method.buffers()])
+    world.barrier()  # rank 0 writes run.json only after all processes have looked for it
+    if world.is_main:
         _record(setup, asked, out, start, taken, quiet=quiet)
     return setup
 
@@ -140,10 +140,10 @@ def _is_finished(asked: Run, pack: Pack, out: Path, world: World) -> bool:
     except ValueError as error:
         if not (out / checkpoint.CHECKPOINT).exists():
             raise ValueError(f"{error} (its checkpoint is gone: delete {out} to train again)") from None
-        if world.writes:
+        if world.is_main:
             print(f"mvitac: {error}; making it again from {out / checkpoint.CHECKPOINT}", file=sys.stderr)
         return False
-    if world.writes:
+    if world.is_main:
         (out / checkpoint.PREVIOUS).unlink(missing_ok=True)  # left by a process that was killed at the very end
     return True
 
@@ -172,12 +172,12 @@ def _hardware(run: Run, pack: Pack, device: torch.device, world: World, begun: P
     if begun:
         return Hardware.choose(device, precision_of(*load_run(begun)))
     measured = device.type == "cpu" and has_bf16(device)
-    made = Hardware.choose(device, "auto", _work(run, pack, device) if measured else None)
-    fp32 = world.anyone(made.precision == "fp32")
+    made = Hardware.choose(device, "auto", _trial_pass(run, pack, device) if measured else None)
+    fp32 = world.any(made.precision == "fp32")
     return Hardware.choose(device, "fp32") if fp32 and made.precision == "bf16" else made
 
 
-def _work(run: Run, pack: Pack, device: torch.device) -> Callable[[], None]:
+def _trial_pass(run: Run, pack: Pack, device: torch.device) -> Callable[[], None]:
     """One pass, forward and backward, of the trunks of ``run`` with random weights, on a few images of its size."""
     networks, spec = [], pack.spec
     with torch.random.fork_rng(devices=[]):
@@ -198,16 +198,16 @@ def _work(run: Run, pack: Pack, device: torch.device) -> Callable[[], None]:
 
 def open_pack(data: DatasetConfig, world: World, quiet: bool) -> Pack:
     """Open ``data``; rank 0 simulates or packs what does not exist yet."""
-    return _first_here(lambda: data.open(quiet=quiet or not world.writes), world)
+    return _main_process_first(lambda: data.open(quiet=quiet or not world.is_main), world)
 
 
-def _first_here(read: Callable[[], T], world: World) -> T:
+def _main_process_first(read: Callable[[], T], world: World) -> T:
     """What ``read`` returns. Rank 0 computes what is not in the cache yet, then the others read it."""
     if world.rank:
-        world.wait()
+        world.barrier()
     found = read()
     if not world.rank:
-        world.wait()
+        world.barrier()
     return found
 
 
@@ -233,7 +233,7 @@ def _locked_features(run: Run, pack: Pack, method: Method, world: World) -> dict
     for m, trunk in method.encoders().items():
         if is_locked(trunk) and run.augment.of(m).fixed and not run.method.needs_vit:
             rows = np.flatnonzero(pack.has(m))
-            known = torch.from_numpy(_first_here(lambda m=m, rows=rows: features(model, pack, m, rows), world))
+            known = torch.from_numpy(_main_process_first(lambda m=m, rows=rows: features(model, pack, m, rows), world))
             found[m] = torch.zeros(pack.num, known.shape[1]).index_put((torch.from_numpy(rows),), known)
             found[m] = found[m].to(next(trunk.parameters()).device)
     return found
@@ -247,5 +247,5 @@ def _check_image_size(method: Method, run: Run, pack: Pack) -> None:
         try:
             model.features(modality, torch.zeros(shape, dtype=torch.uint8, device=device))
         except Exception as error:  # the type differs between trunks
-            given = f"trunk {run.encoder[modality].trunk} does not support images of {model.sides(modality)[0]} px"
+            given = f"trunk {run.encoder[modality].trunk} cannot take images of {model.image_sizes(modality)[0]} px"
             raise ValueError(f"{given} ({brief(error)}): give another --augment.size or --encoder.trunk") from None

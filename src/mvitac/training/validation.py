@@ -34,12 +34,12 @@ ratio: accuracy of a class (errors: wrong rows; guess: all rows), R2 of a value 
 class Validation:
     """Evaluates a method while it trains, compares it with its start, and keeps the best weights.
 
-    ``setup.kept`` is the state of the last checkpoint, which a resumed run continues with; empty at the start.
+    ``setup.validation_state`` is the state of the last checkpoint, which a resumed run continues with; empty at the start.
     """
 
     def __init__(self, out: Path, setup: Setup, log: Log) -> None:
         self.out, self.run, self.method, self.pack, self.spec = out, setup.run, setup.method, setup.pack, setup.spec
-        self.log, self.kept, self.locked = log, setup.kept, setup.views.locked
+        self.log, self.state, self.locked = log, setup.validation_state, setup.views.locked
 
     def __call__(self, step: int, *, last: bool = False) -> None:
         """Evaluate after ``step`` steps; write model.best.safetensors if it is the best so far."""
@@ -47,17 +47,17 @@ class Validation:
         values, cells = validate(model, self.pack, self.run, self.locked)
         self.method.train()
         if step == 0:
-            self.kept["start"] = cells
-        if cells and (error := _error(cells)) < self.kept.get("best", math.inf):
-            self.kept |= {"best": error, "best_step": step}
+            self.state["baseline"] = cells
+        if cells and (error := _error(cells)) < self.state.get("best", math.inf):
+            self.state |= {"best": error, "best_step": step}
             if self.run.eval_every:
                 model.save(self.out / BEST)
                 self.method.train()
-        start = self.kept.get("start") if last else None  # a run that began without validation has none
+        start = self.state.get("baseline") if last else None  # a run that began without validation has none
         said = [] if start is None else verdict(start, cells, self.pack.spec.group_by)
         if start and self.run.eval_every and cells:
-            change = f"errors {100 * (self.kept['best'] / _error(start) - 1):+.0f} % in the mean over tasks"
-            said += [f"best at step {self.kept['best_step']} ({change}, {BEST})"]
+            change = f"errors {100 * (self.state['best'] / _error(start) - 1):+.0f} % in the mean over tasks"
+            said += [f"best at step {self.state['best_step']} ({change}, {BEST})"]
         self.log.evaluation(step, values, said)
 
 
@@ -112,14 +112,14 @@ def _validate(model: Model, pack: Pack, run: Run, locked: Mapping[str, Tensor]) 
 
 
 def _linear(
-    pack: Pack, train_rows: np.ndarray, rows: np.ndarray, bank: dict[str, Tensor], z: dict[str, Tensor]
+    pack: Pack, train_rows: np.ndarray, rows: np.ndarray, train_features: dict[str, Tensor], z: dict[str, Tensor]
 ) -> Cells:
     """Errors by group on ``rows``, with features ``z``, of a linear probe of each task and modality, and of both together.
 
-    It is fitted on ``train_rows``, with features ``bank``.
+    It is fitted on ``train_rows``, with ``train_features``.
     """
     if len(z) > 1:
-        bank, z = (found | {"both": torch.cat(list(found.values()), dim=1)} for found in (bank, z))
+        train_features, z = (found | {"both": torch.cat(list(found.values()), dim=1)} for found in (train_features, z))
     names = np.unique(pack.column("group").astype(str), return_inverse=True)[1]
     groups = torch.from_numpy(names[train_rows])
     by_group = torch.from_numpy(np.unique(names[rows], return_inverse=True)[1])
@@ -132,7 +132,7 @@ def _linear(
                 have, scored = ~y.isnan().any(1), ~true.isnan().any(1)
                 if len(torch.unique(y[have], dim=0)) < 2 or len(torch.unique(true[scored], dim=0)) < 2:
                     continue
-                guess = diagnostics.linear_probe(bank[m][have], y[have], groups[have], z[m][scored])
+                guess = diagnostics.linear_probe(train_features[m][have], y[have], groups[have], z[m][scored])
                 errors = _errors(guess, true[scored])
                 sums = torch.zeros(int(by_group.max()) + 1, 2, dtype=torch.float64)
                 found.append(sums.index_add_(0, by_group[scored], errors))
@@ -215,7 +215,7 @@ def _change(start: Tensor, end: Tensor) -> tuple[float, float]:
 def _shared_space(model: Model, pack: Pack, run: Run, rows: np.ndarray, z: dict[str, Tensor]) -> dict[str, float]:
     """Retrieval in the space shared by both modalities, among ``rows``, whose features are ``z``."""
     device = next(model.parameters()).device
-    for m, (whole, heads) in {m: model.sides(m) for m in z}.items():
+    for m, (whole, heads) in {m: model.image_sizes(m) for m in z}.items():
         if whole != heads:
             z = z | {m: pack_features(model, pack, m, rows, for_heads=True, bf16=run.bf16)}
     shared = {m: model.project(m, z[m].to(device)).cpu() for m in z}

@@ -12,8 +12,8 @@ from mvitac.data.pack import Pack
 from mvitac.methods.base import Views
 from mvitac.run import Run
 from mvitac.system.distributed import World
-from mvitac.training.loader import Feed, ahead, prefetch
-from mvitac.training.sampler import Batches, mix, partners
+from mvitac.training.loader import ImageLoader, prefetch, prefetch_cuda
+from mvitac.training.sampler import Batches, combine_seeds, draw_positives
 from mvitac.training.step import Chunk
 from mvitac.transforms.random_views import draw, random_view
 
@@ -36,38 +36,37 @@ class StepViews:
         locked: Mapping[str, Tensor] | None = None,
     ) -> None:
         self.run, self.pack, self.num, self.device, self.world = run, pack, num, device, world or World()
-        self.feed = Feed(pack, device)
+        self.images = ImageLoader(pack, device)
         self.locked = locked or {}
         share = run.batch_size // self.world.size
-        self.per_process = share // (run.chunk or share)
+        self.chunks_per_process = share // (run.chunk or share)
 
-    def each(self, batches: Batches, start: int, num_steps: int) -> Iterator[list[Chunk]]:
+    def iterate(self, batches: Batches, start: int, num_steps: int) -> Iterator[list[Chunk]]:
         """The chunks of each step from ``start`` to ``num_steps``.
 
         One chunk that is slow to make, or needed on a GPU, is made while the one before is used.
         """
         steps = (self(batches[step], step) for step in range(start, num_steps))
         slow = self.device.type == "cuda" or any(isinstance(images, Lazy) for images in self.pack.images.values())
-        if self.per_process > 1 or not slow:
+        if self.chunks_per_process > 1 or not slow:
             yield from steps
             return
         views = (chunk() for (chunk,) in steps)
-        for made in ahead(views, self.device) if self.device.type == "cuda" else prefetch(views):
+        for made in prefetch_cuda(views, self.device) if self.device.type == "cuda" else prefetch(views):
             yield [lambda made=made: made]
 
     def __call__(self, rows: np.ndarray, step: int) -> list[Chunk]:
         """The chunks of ``rows``, the whole batch of ``step``, that this process embeds."""
-        num = self.per_process * self.world.size
+        num = self.chunks_per_process * self.world.size
         chunks = np.split(rows, num)
-        seeds = [mix(self.run.seed, step) if num == 1 else mix(self.run.seed, step, number) for number in range(num)]
-        mine = range(self.per_process * self.world.rank, self.per_process * (self.world.rank + 1))
-        return [partial(self.make, chunks[number], seeds[number]) for number in mine]
+        mine = range(self.chunks_per_process * self.world.rank, self.chunks_per_process * (self.world.rank + 1))
+        return [partial(self.make, chunks[n], combine_seeds(self.run.seed, step, n)) for n in mine]
 
     def make(self, rows: np.ndarray, seed: int) -> Views:
         """Views of pack rows [B] on the device, in the precision that the networks read them in."""
         run, pack, generator, to = self.run, self.pack, torch.Generator().manual_seed(seed), self.device
-        sources = self._sources(rows, generator)
-        has, both = _senses(pack, rows), {}
+        sources = self._view_rows(rows, generator)
+        has, both = _present(pack, rows), {}
         if not all(there.all() for there in has.values()):
             pairs = np.logical_and.reduce(list(has.values()))
             both = {m: torch.from_numpy(np.flatnonzero(pairs[there])).to(to) for m, there in has.items()}
@@ -78,9 +77,9 @@ class StepViews:
             if m in self.locked:
                 for source in sources[m]:  # the other modality's views stay the same
                     draw(run.augment.of(m), len(own[id(source)]), pack.size, generator)
-            load = self.locked[m].__getitem__ if m in self.locked else partial(self.feed, m)
+            load = self.locked[m].__getitem__ if m in self.locked else partial(self.images, m)
             fed = {name: load(source) for name, source in own.items()}
-            how = run.augment.of(m), run.augment.size_of(m), generator, dtype, run.encoder[m].levels
+            how = run.augment.of(m), run.augment.size_of(m), generator, dtype, run.encoder[m].mean_std
             shown = [fed[id(source)] for source in sources[m]]
             images[m] = shown if m in self.locked else [random_view(one, *how) for one in shown]
         splits = run.method.label_splits
@@ -88,21 +87,21 @@ class StepViews:
         values = {task: value.to(to) for task, value in values_of(run, pack, rows).items()}
         return Views(images, labels, torch.from_numpy(rows).to(to), values, both, torch.tensor(seed).to(to))
 
-    def _sources(self, rows: np.ndarray, generator: torch.Generator) -> dict[str, list[np.ndarray]]:
+    def _view_rows(self, rows: np.ndarray, generator: torch.Generator) -> dict[str, list[np.ndarray]]:
         """Modality -> the rows that each of its views shows (``Run.positives``)."""
         run, pack = self.run, self.pack
-        views, others = [rows] * self.num, partial(partners, pack, rows, generator, within=run.positives_within)
+        views, others = [rows] * self.num, partial(draw_positives, pack, rows, generator, within=run.positives_within)
         if run.positives != "same-image":
             views[1:] = [others() for _ in views[1:]]
         sources = dict.fromkeys(pack.spec.modalities, views)
         if run.positives == "same-touch-pairs" and self.num == 1:
             sources["touch"] = [others()]
         if run.method.sensor_view:
-            sources["touch"] = [*sources["touch"], partners(pack, rows, generator, other_sensor=True)]
+            sources["touch"] = [*sources["touch"], draw_positives(pack, rows, generator, other_sensor=True)]
         return sources
 
 
-def _senses(pack: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
+def _present(pack: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
     """Modality -> bool [B], which of ``rows`` have an image. Of a mix, modalities of fewer than two rows are left out."""
     if not pack.parts:
         return dict.fromkeys(pack.spec.modalities, np.ones(len(rows), bool))

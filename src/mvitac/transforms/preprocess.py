@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mvitac.data.images import decode, difference, fit, to_rgb
 from mvitac.system.files import brief
-from mvitac.transforms.random_views import IMAGENET, Levels, normalise, plain_view
+from mvitac.transforms.random_views import IMAGENET, MeanStd, normalise, plain_view
 
 ImageInput = str | Path | np.ndarray | Tensor | Image.Image | Sequence[Any]
 """One image or several, as ``Model.embed`` accepts them."""
@@ -39,7 +39,7 @@ class Preprocess:
     """Side of normalised images for the trunk. None: uint8 at ``stored`` pixels, for ``Model.forward``."""
     background: np.ndarray | None = None  # the touch sensor without contact, uint8 [H, W, C], to subtract
     frames: int = 1  # frames of a window; ``channels`` are those of all of them, the newest first
-    levels: Levels = IMAGENET  # by which images for the trunk are normalised
+    mean_std: MeanStd = IMAGENET  # by which images for the trunk are normalised
 
     def __call__(self, image: ImageInput) -> Tensor:
         """One image (a path, PIL image, array or tensor) to uint8 [C, stored, stored], or fp32 [C, size, size].
@@ -47,7 +47,7 @@ class Preprocess:
         With several ``frames``: one clip, as for ``Model.embed``.
         """
         pixels = torch.from_numpy(self._stored(image, self.background)).permute(2, 0, 1).contiguous()
-        return pixels if self.size is None else plain_view(pixels[None], self.size, self.levels)[0].contiguous()
+        return pixels if self.size is None else plain_view(pixels[None], self.size, self.mean_std)[0].contiguous()
 
     def batches(self, images: ImageInput, background: ImageInput | None, num: int) -> Iterator[Tensor]:
         """Batches uint8 [<= num, C, stored, stored] of one image or several, read as they are needed.
@@ -163,11 +163,11 @@ def resized(images: Tensor, side: int) -> Tensor:
     return levels.round().to(torch.uint8) if whole and not images.is_cpu else levels
 
 
-def encoder_input(images: Tensor, size: int, levels: Levels = IMAGENET) -> Tensor:
+def encoder_input(images: Tensor, size: int, mean_std: MeanStd = IMAGENET) -> Tensor:
     """Images [B, C, H, W], uint8 or float in [0, 1], as normalised fp32 [B, C, size, size].
 
     Gradients flow to float images.
     """
     if images.dtype == torch.uint8:
-        return plain_view(images, size, levels)
-    return normalise(resized(images.float(), size), levels)
+        return plain_view(images, size, mean_std)
+    return normalise(resized(images.float(), size), mean_std)

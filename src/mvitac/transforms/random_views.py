@@ -19,9 +19,9 @@ from mvitac.registry import check_range
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-Levels = tuple[tuple[float, ...], tuple[float, ...]]
+MeanStd = tuple[tuple[float, ...], tuple[float, ...]]
 """Mean and standard deviation of R, G, B, by which levels in [0, 1] are normalised."""
-IMAGENET: Levels = (IMAGENET_MEAN, IMAGENET_STD)
+IMAGENET: MeanStd = (IMAGENET_MEAN, IMAGENET_STD)
 
 LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, as PIL and torchvision use it
 NUM_TRIES = 10  # to draw a crop that fits, then the largest possible one, as in torchvision's RandomResizedCrop
@@ -128,21 +128,21 @@ def apply(
     drawn: Drawn,
     size: int,
     dtype: torch.dtype = torch.float32,
-    levels: Levels = IMAGENET,
+    mean_std: MeanStd = IMAGENET,
 ) -> Float[Tensor, "B C S S"]:
     """Apply the parameters ``drawn``: crop to [size, size], flip, colour, normalise. Returns channels-last on their device.
 
     Computed in fp32 and rounded to ``dtype`` once, as autocast would round it before the first convolution.
     """
     implementation = _one_by_one if images.device.type == "cpu" else _batched
-    return implementation(images, drawn, size, dtype, levels)
+    return implementation(images, drawn, size, dtype, mean_std)
 
 
-def _one_by_one(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype, levels: Levels) -> Tensor:
+def _one_by_one(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype, mean_std: MeanStd) -> Tensor:
     """The implementation for CPUs. One image at a time stays in the cache, as uint8 until the last step."""
     num, channels = images.shape[:2]
     out = torch.empty(num, size, size * channels, dtype=dtype)  # lines of pixels with their channels: long inner loops
-    factors, offsets = (t.repeat(size * channels // 3) for t in _normalisation(images.device, levels))
+    factors, offsets = (t.repeat(size * channels // 3) for t in _normalisation(images.device, mean_std))
     luma = _luma(images.device).flatten()
     jittered = (drawn.gains != 1).any(1)
     for i, line in enumerate(out):
@@ -170,7 +170,7 @@ def _crop(image: UInt8[Tensor, "C H W"], box: list[int], flip: bool, size: int) 
     return crop.permute(2, 3, 0, 1).reshape(size, size, -1)
 
 
-def _batched(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype, levels: Levels = IMAGENET) -> Tensor:
+def _batched(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype, mean_std: MeanStd = IMAGENET) -> Tensor:
     """The implementation for GPUs: crop, resize and flip the whole batch by two matrix products, Y @ image @ X'.
 
     The antialiased filter is the same as on the CPU. On a GPU it uses fp16, in which pixels are exact and the weights cause
@@ -186,7 +186,7 @@ def _batched(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype, levels
     with torch.autocast(device.type, enabled=False):
         cropped = rows @ images.to(exact) @ columns.mT
     sensors = cropped.float().round_().div_(255).unflatten(1, (-1, 3))
-    scale, shift = (t.view(3, 1, 1) for t in _normalisation(device, levels))
+    scale, shift = (t.view(3, 1, 1) for t in _normalisation(device, mean_std))
     view = torch.addcmul(shift, _colour(sensors, drawn), scale * 255)
     return view.flatten(1, 2).to(dtype, memory_format=torch.channels_last)
 
@@ -203,9 +203,9 @@ def _resampling(start: Tensor, length: Tensor, side: int, size: int) -> Float[Te
 
 
 @lru_cache
-def _normalisation(device: torch.device, levels: Levels) -> tuple[Tensor, Tensor]:
+def _normalisation(device: torch.device, mean_std: MeanStd) -> tuple[Tensor, Tensor]:
     """Factor and offset [3] that normalise levels 0-255 by mean and standard deviation."""
-    mean, std = (torch.tensor(v, dtype=torch.float64) for v in levels)
+    mean, std = (torch.tensor(v, dtype=torch.float64) for v in mean_std)
     return (1 / (255 * std)).float().to(device), (-mean / std).float().to(device)
 
 
@@ -235,22 +235,22 @@ def random_view(
     size: int,
     generator: torch.Generator,
     dtype: torch.dtype = torch.float32,
-    levels: Levels = IMAGENET,
+    mean_std: MeanStd = IMAGENET,
 ) -> Float[Tensor, "B C S S"]:
     """One random view of each image. All randomness comes from ``generator``, which is on the CPU."""
     num, _, side, _ = images.shape
-    return apply(images, draw(config, num, side, generator), size, dtype, levels)
+    return apply(images, draw(config, num, side, generator), size, dtype, mean_std)
 
 
-def plain_view(images: UInt8[Tensor, "B C H W"], size: int, levels: Levels = IMAGENET) -> Float[Tensor, "B C S S"]:
+def plain_view(images: UInt8[Tensor, "B C H W"], size: int, mean_std: MeanStd = IMAGENET) -> Float[Tensor, "B C S S"]:
     """Whole images resized to ``size`` and normalised, without randomness, for probes and predictions."""
     num, _, height, width = images.shape
     whole = torch.tensor([[0, 0, height, width]]).expand(num, 4)
     never = torch.zeros(num, dtype=torch.bool)
-    return apply(images, Drawn(whole, never, never, torch.ones(num, 5)), size, levels=levels)
+    return apply(images, Drawn(whole, never, never, torch.ones(num, 5)), size, mean_std=mean_std)
 
 
-def normalise(images: Float[Tensor, "B C H W"], levels: Levels = IMAGENET) -> Float[Tensor, "B C H W"]:
+def normalise(images: Float[Tensor, "B C H W"], mean_std: MeanStd = IMAGENET) -> Float[Tensor, "B C H W"]:
     """Normalise images with levels in [0, 1]. Returns channels-last."""
-    scale, shift = (t.repeat(images.shape[1] // 3).view(-1, 1, 1) for t in _normalisation(images.device, levels))
+    scale, shift = (t.repeat(images.shape[1] // 3).view(-1, 1, 1) for t in _normalisation(images.device, mean_std))
     return torch.addcmul(shift, images, scale * 255).contiguous(memory_format=torch.channels_last)

@@ -127,11 +127,11 @@ class ExternalModel(Model):
         """The encoder, as one of the modalities that it reads has it."""
         return next(iter(self.parts.values()))
 
-    def sides(self, modality: str) -> tuple[int, int]:
+    def image_sizes(self, modality: str) -> tuple[int, int]:
         side = max(self.part.preprocessing.size)
         return side, side
 
-    def levels(self, modality: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    def mean_std(self, modality: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
         return self.part.preprocessing.mean, self.part.preprocessing.std
 
     @property
@@ -152,15 +152,15 @@ class ExternalModel(Model):
         Raises:
             ValueError: If the data has no image that this model reads.
         """
-        senses = tuple(m for m in self.parts if m in pack.spec.modalities)
-        if not senses:
+        modalities = tuple(m for m in self.parts if m in pack.spec.modalities)
+        if not modalities:
             known = f"{' and '.join(self.parts)}, {pack.spec.name!r} has {', '.join(pack.spec.modalities)}"
             raise ValueError(f"{self.text} reads {known}: give reads=touch, vision or both")
         notes: tuple[str, ...] = ()
         want = self.part.preprocessing
         if want.frames > 1 and not pack.spec.window.active:
             try:
-                pack = windowed(pack, Window(frames=want.frames, stride=want.stride, of=senses))
+                pack = windowed(pack, Window(frames=want.frames, stride=want.stride, of=modalities))
             except ValueError as error:
                 notes = (f"the current frame is repeated ({error})",)
         return ExternalModel(self.text, self.part, pack.spec, pack.size, notes), pack

@@ -130,7 +130,7 @@ def join(
         note += f", and {apart} of these say something else than another" * bool(apart)
         rows = [{**row, **{c: more.get(c, "") for c in names}} for row, more in zip(table.rows, made, strict=True)]
         table = replace(table, rows=rows, digest=digest([table.digest, made]), notes=(*table.notes, note))
-        table = table.kept(there, "")
+        table = table.filtered(there, "")
         refs = [ref for ref, kept in zip(refs, there, strict=True) if kept]
     return table
 

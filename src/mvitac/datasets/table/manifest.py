@@ -91,7 +91,7 @@ class Manifest:
         name = row.get("id") or next((row[column] for column in self.images if row.get(column)), "")
         return f"{self.path} row {self.numbers[i]}" + (f" ({name})" if name else "")
 
-    def kept(self, holds: Sequence[bool], why: str) -> "Manifest":
+    def filtered(self, holds: Sequence[bool], why: str) -> "Manifest":
         """Return the rows for which ``holds``; ValueError says ``why`` there are none."""
         rows = [i for i, kept in enumerate(holds) if kept]
         if not rows:

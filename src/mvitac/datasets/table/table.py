@@ -271,7 +271,7 @@ class Rows(Source):
             how = {column: looks.get(like.get(column, column), {}) | {"bgr": config.bgr} for column in shown}
             seen = {c: [ref and replace(ref, **how[c]) for ref in refs] for c, refs in table.images.items()}
             table = replace(table, images=seen)
-        table = table.kept(all_hold(config.only, table), f"no row meets {' and '.join(config.only)}")
+        table = table.filtered(all_hold(config.only, table), f"no row meets {' and '.join(config.only)}")
         if not config.no_contact and not config.difference:
             return table, []
         empty = all_hold(config.no_contact, table) if config.no_contact else None
@@ -280,7 +280,7 @@ class Rows(Source):
             return table, found
         kept = [not none for none in empty]
         found = [ground for ground, keep in zip(found, kept, strict=True) if keep]
-        return table.kept(kept, f"every row meets {' and '.join(config.no_contact)}"), found
+        return table.filtered(kept, f"every row meets {' and '.join(config.no_contact)}"), found
 
     def _assign(
         self, table: Manifest, whole: dict[str, list[str]], tasks: Sequence[AnyTask], labels: Sequence[Sequence[int]]
