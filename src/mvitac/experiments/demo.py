@@ -20,8 +20,8 @@ def run_demo(run: Run, out: Path, num_seeds: int) -> Path:
     ``out`` gets the runs (seed0, seed1, ...), probe.json (all scores), summary.json (task -> modality -> method or
     control -> mean, low, high, seeds, groups) and report/. Returns the path of the report's page.
     """
-    if num_seeds < 1:
-        raise ValueError(f"seeds {num_seeds}: give at least 1")
+    if not 1 <= num_seeds <= 1000:
+        raise ValueError(f"seeds {num_seeds}: give 1 to 1000")
     start = time.perf_counter()
     print(f"1/4 simulating {run.data.name}: {getattr(run.data, 'num', '')} pairs, kept in the cache")
     pack = run.data.open()

@@ -72,8 +72,8 @@ class Finetuning:
     """Go on if the model, or one it started from, was trained on test rows or groups. LEAK stands beside every score."""
 
     def __post_init__(self) -> None:
-        if not (self.lr and self.steps and self.fractions and self.seeds > 0 and self.batch_size > 1):
-            raise ValueError("give at least one of lr, steps, fractions and seeds, and a batch size of 2 or more")
+        if not (self.lr and self.steps and self.fractions and 0 < self.seeds <= 1000 and self.batch_size > 1):
+            raise ValueError("give at least one of lr, steps, fractions, seeds (up to 1000), and batches of 2 or more")
         ProbeConfig(fractions=self.fractions)  # checks them
 
 

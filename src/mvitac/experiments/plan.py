@@ -73,8 +73,8 @@ class Plan:
 
     def __post_init__(self) -> None:
         labels = [row.label for row in self.rows]
-        if self.seeds < 1:
-            raise ValueError(f"seeds {self.seeds}: give at least 1")
+        if not 1 <= self.seeds <= 1000:
+            raise ValueError(f"seeds {self.seeds}: give 1 to 1000")
         if taken := sorted(set(labels) & set(CONTROLS)):
             raise ValueError(f"row {taken[0]!r} has the name of a control: give it another label")
         if len({slug(label) for label in labels}) < len(labels):
