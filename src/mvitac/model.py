@@ -22,7 +22,7 @@ from mvitac.nn.encoders import num_features, timm_trunk
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.nn.weights import misfit, read_model, safetensors_digest, write_model
 from mvitac.registry import from_json, to_json, unknown
-from mvitac.run import Run
+from mvitac.run import Run, load_run
 from mvitac.system.files import brief, digest, parse_json
 from mvitac.system.sealed_folder import ARTIFACT
 from mvitac.transforms.preprocess import ImageInput, Preprocess, check_images, encoder_input, resized, to_array
@@ -356,6 +356,10 @@ def load(path: str | Path, which: Which = "last") -> Model:
             raise ValueError(f"stored {stored}: expected 1 to {MAX_STORED} px")
     except (KeyError, ValueError) as error:
         raise ValueError(f"{file} has a damaged header ({brief(error)}): copy it again or re-train") from None
+    beside = file.with_name("run.json")  # and with it the list of rows that the run learned from
+    own = run if foreign or not beside.exists() else replace(load_run(beside)[0], precision=run.precision)
+    if own is not run and own.digest() != run.digest():
+        raise ValueError(f"{file} is of another run than {beside}: put it elsewhere")
     # The file has all weights, so the empty model needs no pretrained ones, and no download.
     empty = run.fresh()
     # Check shapes before allocating: a damaged header may describe a network larger than the memory.

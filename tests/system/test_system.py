@@ -17,6 +17,7 @@ from filelock import FileLock
 from mvitac.data.pack import Pack
 from mvitac.deploy.export import export
 from mvitac.deploy.publish import publish
+from mvitac.evaluation.classifiers import one_blas_thread
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.model import load
 from mvitac.system import progress
@@ -89,7 +90,8 @@ def test_several_at_a_time_in_order_and_the_threads_come_back(two_threads: None)
         met.wait()
         return 36 // item, torch.get_num_threads()
 
-    assert in_threads(work, range(1, 5)) == [(36, 1), (18, 1), (12, 1), (9, 1)]
+    with one_blas_thread():  # as probes are fitted
+        assert in_threads(work, range(1, 5)) == [(36, 1), (18, 1), (12, 1), (9, 1)]
     with pytest.raises(ZeroDivisionError):
         in_threads(work, range(2))
     assert torch.get_num_threads() == 2
@@ -105,7 +107,7 @@ def test_probes_do_not_depend_on_it(
         monkeypatch.setenv("MVITAC_CACHE", str(tmp_path / str(threads)))
         model = load(smoke_run)
         model.run = replace(model.run, seed=1)
-        other = shutil.copytree(smoke_run, tmp_path / f"run{threads}")
+        (other := tmp_path / str(threads) / "other").mkdir(parents=True)
         model.save(other / "model.safetensors")
         return probe_runs([smoke_run, other], ProbeConfig(tasks=("bright",), modalities=("both",)), pack)["summary"]
 

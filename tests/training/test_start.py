@@ -145,6 +145,8 @@ def test_other_weights_are_refused_at_resume(pack: Pack, smoke_run: Path, tmp_pa
         train(run, out, resume=True, quiet=True)
     with pytest.raises(ValueError, match=r"source now holds other weights than this run was recorded with"):
         train(load_run(out)[0], tmp_path / "again", quiet=True)
+    with pytest.raises(ValueError, match="is of another run than"):
+        train(smoke(pack, init=Init(path=source)), tmp_path / "new", quiet=True)
 
 
 @pytest.fixture(scope="module")

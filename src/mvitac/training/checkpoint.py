@@ -27,10 +27,7 @@ CHECKPOINT, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
 def save(
     out: Path, run: Run, method: Method, optimiser: torch.optim.Optimizer, step: int, validation: dict[str, Any]
 ) -> None:
-    """Write the state after ``step`` steps to checkpoint.pt in the run's folder ``out``, and keep the one before it.
-
-    ``validation`` is its state (tensors and numbers).
-    """
+    """Write the state after ``step`` steps, with that of validation, to checkpoint.pt in ``out``; keep the one before."""
     state = {"method": method.state_dict(), "optimiser": optimiser.state_dict(), "step": step}
     buffer = io.BytesIO()  # torch.save to a file would hide the error of a full disk
     torch.save({**state, "run": run.digest(), "validation": validation}, buffer)
@@ -69,7 +66,7 @@ def restore(
         if damage and (world is None or world.is_main):
             print(f"mvitac: {damage}; continuing from {path}, step {state['step']}", file=sys.stderr)
             (out / CHECKPOINT).unlink()  # else the next checkpoint would push it to the place of the good one
-        return state["step"], state.get("validation", {})
+        return state["step"], state["validation"]
     if damage:
         raise ValueError(f"{damage}: delete it{f' and {PREVIOUS}' if len(found) > 1 else ''} to start over")
     return 0, {}

@@ -202,7 +202,6 @@ def verdict(start: Cells, end: Cells, by: str) -> list[str]:
 
 def _change(start: Tensor, end: Tensor) -> tuple[float, float]:
     """How many points a score has risen, and half the width of its interval over groups (0 for one group)."""
-
     points, num = float(100 * (_scores(end) - _scores(start)).mean()), end.shape[1]
     if num < 2:
         return points, 0.0

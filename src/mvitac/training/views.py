@@ -57,8 +57,7 @@ class StepViews:
 
     def __call__(self, rows: np.ndarray, step: int) -> list[Chunk]:
         """The chunks of ``rows``, the whole batch of ``step``, that this process embeds."""
-        num = self.chunks_per_process * self.world.size
-        chunks = np.split(rows, num)
+        chunks = np.split(rows, self.chunks_per_process * self.world.size)
         mine = range(self.chunks_per_process * self.world.rank, self.chunks_per_process * (self.world.rank + 1))
         return [partial(self.make, chunks[n], combine_seeds(self.run.seed, step, n)) for n in mine]
 
