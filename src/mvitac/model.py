@@ -297,7 +297,14 @@ class Model(nn.Module):
     def features_key(self, modality: str) -> str:
         """Content address of what the features of ``modality`` depend on. Models that share a tower share it."""
         encoder = self.run.encoder[modality]
-        kind = encoder.trunk, encoder.temporal, self.mean_std(modality), self.image_sizes(modality)[0], self.stored
+        kind = (
+            encoder.trunk,
+            encoder.temporal,
+            encoder.pool,
+            self.mean_std(modality),
+            self.image_sizes(modality)[0],
+            self.stored,
+        )
         return digest([safetensors_digest(tensors_of(self.encoders[modality])), *kind])
 
     def save(self, path: Path, *, half: bool = False) -> None:

@@ -292,6 +292,7 @@ FORGED: dict[str, tuple[Change, str]] = {
     "weights twice": (put("encoder", value=lambda e: e | {"seeds": [0, 1], "weights": 2 * e["weights"]}), "has 1 wei"),
     "group twice": (put("blocks", 0, "groups", value=lambda names: [*names[:-1], names[0]]), "a group is there twice"),
     "field": (put("mine", value=1), "has the unknown field 'mine'"),
+    "field about": (put("about", "mine", value=1), "has the unknown field 'mine'"),
     "field of a block": (put("blocks", 0, "mine", value=1), "has the unknown field 'mine'"),
     "excuse": (
         put("blocks", 0, "left_out", value={"vision": "the encoder has no vision"}),

@@ -125,6 +125,16 @@ def nan():
     nn.init.constant_(net.conv.weight, float("nan"))
     return net, {}
 
+def batch():
+    net = nn.Sequential(Net(), nn.BatchNorm2d(5))
+    net.train = lambda mode=True: net  # stays in training mode
+    return net, {"size": 16}
+
+def zero():
+    net = Net()
+    nn.init.zeros_(net.conv.weight)
+    return net, {"size": 16}
+
 def bare():
     return Net()
 
@@ -162,6 +172,10 @@ def test_python_functions(pack: Pack, functions: str) -> None:
     torch.testing.assert_close(tokens, (images.float() / 255).mean(1).flatten(1))
     with pytest.raises(ValueError, match="NaN or infinite features of touch"):
         open_model(f"{functions}nan").on(pack)[0].features("touch", images)
+    with pytest.raises(ValueError, match="batch: features of touch depend on the other images, or on chance"):
+        open_model(f"{functions}batch").on(pack)[0].features("touch", images)
+    with pytest.raises(ValueError, match=f"features of touch are the same for all {pack.num} images"):
+        features(open_model(f"{functions}zero").on(pack)[0], pack, "touch", np.arange(pack.num))
     keys = [open_model(f"{functions}{name}").on(pack)[0] for name in ("tokens", "same", "same")]
     assert len({net.features_key("touch") for net in keys}) == 3 and len({net.weights_digest() for net in keys}) == 2
     for name, words in (

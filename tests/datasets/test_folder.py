@@ -605,10 +605,14 @@ def test_rows_that_share_something_are_told_where_no_group_is_given(tmp_path: Pa
         names = {m: f"{m}/rec-{i // 6}_{i:03d}b.png" for m in ("vision", "left", "right")}
         for m, name in names.items():
             (tmp_path / str(row[m])).rename(tmp_path / name)
-        given.append({**names, "material": row["material"], "seq": row["seq"], "press": f"press {i // 2}"})
+        given.append({**names, "material": row["material"], "seq": row["seq"], "press": f"press {i // 2}", "shot": i})
     file = write(given, tmp_path / "m.csv")
     (note,) = FolderConfig(path=file, labels=("material",), split_seed=1).source().spec().notes
     assert re.search(r"also in train: press \d of \d, names of vision files 4 of 4\)$", note)
     assert not FolderConfig(path=file, labels=("material",), group="press").source().spec().notes
+    (note,) = FolderConfig(path=file, labels=("material",), group="shot", split_seed=1).source().spec().notes
+    assert (
+        note.startswith("column shot has another value in each row, so every row is its own group") and "press" in note
+    )
     findings = examine_source(FolderConfig(path=file, labels=("material",), size=16).source(), quiet=True)
     assert [(f.verdict, f.item) for f in findings if "vision files" in f.evidence] == [("look", "groups")]

@@ -14,11 +14,12 @@ from mvitac.evaluation import features
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
-from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, build_trunk
+from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, build_trunk, num_features, within
 from mvitac.nn.momentum import Momentum
 from mvitac.run import Run
 from mvitac.training import setup
 from mvitac.training.loop import train
+from mvitac.training.start import load_trunk
 from mvitac.transforms.random_views import Augment, ViewAugment
 from support.small_methods import small
 from support.toy import Toy
@@ -95,7 +96,9 @@ def test_a_locked_trunk_sees_each_whole_image_once(
 ) -> None:
     """The run is the one whose trunk sees it at every step, to rounding, and resumes bit for bit. Probes read the same."""
     whole = ViewAugment(scale=(1.0, 1.0), flip=0.0, grayscale=0.0, size=24)
-    run = replace(started(pack, file, locked=True), method=small(name), augment=replace(SIZES, vision=whole))
+    run = replace(
+        started(pack, file, locked=True, pool="stages"), method=small(name), augment=replace(SIZES, vision=whole)
+    )
     monkeypatch.setenv("MVITAC_CACHE", str(tmp_path))
     seen: list[str] = []
     real = features.pack_features
@@ -108,6 +111,18 @@ def test_a_locked_trunk_sees_each_whole_image_once(
     first, second = weights(once), weights(tmp_path / "seen")
     for parameter, value in first.items():
         torch.testing.assert_close(value, second[parameter], rtol=1e-3, atol=1e-4, msg=parameter)
+
+
+def test_features_of_all_stages() -> None:
+    config = EncoderConfig(trunk=TWO.vision.trunk, weights="scratch", temporal="mean", pool="stages")
+    trunk, images = build_trunk(config, 6, frames=2).eval(), torch.rand(3, 6, 40, 40)
+    maps = within(trunk).forward_intermediates(images.unflatten(1, (2, 3)).flatten(0, 1))[1]  # type: ignore[operator]
+    expected = torch.cat([each.flatten(2).mean(2) for each in maps], 1).unflatten(0, (3, 2)).mean(1)
+    torch.testing.assert_close(trunk(images), expected)
+    assert expected.shape[1] == num_features(trunk)
+    other = build_trunk(replace(config, pool="last", temporal="stack"), 3)
+    load_trunk(other, trunk.state_dict())
+    assert torch.equal(other.state_dict()["conv1.0.weight"], within(trunk).state_dict()["conv1.0.weight"])
 
 
 def test_a_momentum_copy_shares_a_locked_trunk() -> None:

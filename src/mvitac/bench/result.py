@@ -36,6 +36,7 @@ KEY = ("source", "seed", "modality", "probe")
 COUNTS = ("n", "correct")  # sums per group of classes: rows, and those that are right
 ABOUT_ROWS = ("n", "value", "squared_value")  # sums that depend on the rows alone
 FIELDS = ("format", "format_version", "suite", "suite_digest", "encoder", "versions", "blocks", *VOLATILE)
+ABOUT = ("python", "machine", "commit", "time", "seconds")
 BLOCK = ("set", "task", "not_run", "form", "data", "group_by", "groups", "leaks", "left_out", "records", "notes")
 GUESS = "majority or mean"  # what the page calls these two controls
 MAX_NAME = 200
@@ -144,7 +145,11 @@ def problems(value: dict[str, Any]) -> list[str]:
     """What is missing in a result, or cannot be, in one line each: tasks, scores, controls, sums, data."""
     suite, encoder = suite_of(value), value["encoder"]
     found = list(problems_of(encoder, (*CONTROLS, GUESS)))
-    for fields, known in ((value, FIELDS), *((block, BLOCK) for block in value["blocks"])):
+    for fields, known in (
+        (value, FIELDS),
+        (value.get("about", {}), ABOUT),
+        *((block, BLOCK) for block in value["blocks"]),
+    ):
         found += [f"has the unknown field {name!r}" for name in sorted(fields.keys() - {*known})]
     asked = [(one, ask) for one in suite.sets for ask in one.tasks]
     if (want := [(s.name, t.name) for s, t in asked]) != (have := [(b["set"], b["task"]) for b in value["blocks"]]):

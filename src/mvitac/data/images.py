@@ -2,6 +2,7 @@
 
 import re
 import struct
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -31,6 +32,7 @@ def shrink(image: Image.Image, size: int) -> np.ndarray:
 
 IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".gif")
 MAX_PIXELS = 80_000_000  # of one image; 240 MB as RGB
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # ``decode`` refuses such images itself
 FORMATS = ("JPEG", "PNG", "BMP", "TIFF", "WEBP", "PPM", "GIF")
 """What a file is read as, whatever its name (JPEG: a camera's MPO, too). Pillow would start Ghostscript for an EPS."""
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from mvitac.registry import unknown
 
 MODALITIES = ("vision", "touch")
-UNGROUPED = "no --group was given"  # begins the note of a table whose rows are their own groups
+UNGROUPED = "so every row is its own group"  # is in the note of a table whose rows are their own groups
 SUFFIXES = {"raw": ".npy", "jpeg": ".jpegs"}  # of image files, by how images are stored
 Store = Literal["raw", "jpeg"]
 QUALITY = 95

@@ -150,9 +150,9 @@ def starts_of(runs: Sequence[Run], specs: Sequence[DataSpec]) -> list[tuple[Run,
     built = [(run, spec, *parts_of(run, spec)) for run, spec in zip(runs, specs, strict=True)]
     built.sort(key=lambda each: (len(each[2]), each[3]), reverse=True)
     found: list[tuple[Run, DataSpec]] = []
-    covered: set[tuple[int, str, str, int]] = set()
+    covered: set[tuple[int, str, str, str, int]] = set()
     for run, spec, modalities, _ in built:
-        parts = {(run.seed, m, run.encoder[m].trunk, run.augment.whole_of(m)) for m in modalities}
+        parts = {(run.seed, m, run.encoder[m].trunk, run.encoder[m].pool, run.augment.whole_of(m)) for m in modalities}
         if not parts <= covered:
             covered |= parts
             found.append((run, spec))
@@ -182,5 +182,5 @@ def imagenet_trunk(encoder: EncoderConfig) -> EncoderConfig | None:
     """The trunk of ``encoder`` with ImageNet weights, or one whose weights come as a package; None if none are here."""
     for trunk in (encoder.trunk, *imagenet.PACKAGES):
         if imagenet.source(trunk):
-            return EncoderConfig(trunk=trunk, temporal=encoder.temporal)
+            return EncoderConfig(trunk=trunk, temporal=encoder.temporal, pool=encoder.pool)
     return None

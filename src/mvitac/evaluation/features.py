@@ -55,6 +55,9 @@ def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_h
             return np.load(io.BytesIO(data), allow_pickle=False)
     with work(f"reading {modality} features", len(rows), "images") as advance:
         values = pack_features(model, pack, modality, rows, for_heads=for_heads, advance=advance).numpy()
+    constant = len(rows) > 1 and np.ptp(values, axis=0).max() <= 1e-6 * np.abs(values).max()
+    if constant and np.ptp(pack.images[modality][rows[:64]], axis=0).any():
+        raise ValueError(f"features of {modality} are the same for all {len(rows)} images: check the weights")
     buffer = io.BytesIO()
     np.save(buffer, values)
     buffer.write(hashlib.sha256(buffer.getbuffer()).digest())

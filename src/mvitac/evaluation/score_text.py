@@ -68,11 +68,13 @@ def covered(group_by: str, records: Sequence[dict[str, Any]]) -> str:
 
 
 def tested_on(task: dict[str, Any], group_by: str) -> str:
-    """The test groups of one task's summary, such as '24 test instances'; one group allows no interval."""
+    """The test groups of one task's summary, such as '24 test instances'; too few allow no interval."""
     nums = {cell["groups"] for cells in task.values() for cell in cells.values()}
-    if nums == {1}:
-        return f"1 test {group_by}, so no interval"
-    return f"{' to '.join(str(num) for num in sorted({min(nums), max(nums)}))} test {group_by}s"
+    text = f"{' to '.join(str(num) for num in sorted({min(nums), max(nums)}))} test {group_by}{'s' * (nums != {1})}"
+    endless = [
+        c for cells in task.values() for c in cells.values() if c["low"] is None and percent(c["high"]) == "100.0"
+    ]
+    return text + (", so no interval" if nums == {1} else ", too few for some intervals" * bool(endless))
 
 
 def columns_of(task: dict[str, Any]) -> list[str]:

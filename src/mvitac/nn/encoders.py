@@ -97,6 +97,9 @@ class EncoderConfig:
     temporal: Literal["stack", "mean"] = "stack"
     """How several frames of a window are read. stack: as channels of one image. mean: the trunk sees each frame, and their
     features are averaged."""
+    pool: Literal["last", "stages"] = "last"
+    """Features of the trunk. last: its own, pooled after the last layer. stages: the means of the maps of all its stages,
+    side by side; early ones keep texture that the last layer of a network from ImageNet has lost."""
     locked: bool = False
     """Keep the trunk as it starts; its heads and the other trunk are trained (LiT, arXiv:2111.07991)."""
     keep_norms: bool = False
@@ -167,6 +170,7 @@ def build_trunk(config: EncoderConfig, channels: int, frames: int = 1) -> nn.Mod
         for name in stem_names(trunk):
             trunk.get_submodule(name).reset_parameters()  # type: ignore[operator]
     trunk = use_products(trunk)
+    trunk = trunk if config.pool == "last" else Stages(trunk)
     trunk = trunk if single else PerFrame(trunk, frames)
     trunk.locked, trunk.keep_norms = config.locked, config.keep_norms  # type: ignore[assignment]
     return trunk.requires_grad_(False) if config.locked else trunk
@@ -186,6 +190,26 @@ def keep_modes(network: nn.Module) -> None:
             for layer in trunk.modules():
                 if isinstance(layer, nn.modules.batchnorm._BatchNorm):
                     layer.eval()
+
+
+class Stages(nn.Module):
+    """A timm model whose features are the means of the maps of its stages, side by side: [B, C, H, W] to [B, D]."""
+
+    def __init__(self, trunk: nn.Module) -> None:
+        super().__init__()
+        self.trunk = trunk
+        self.num_features = sum(stage["num_chs"] for stage in trunk.feature_info)  # type: ignore[union-attr]
+
+    def forward(self, images: Tensor) -> Tensor:
+        maps = self.trunk.forward_intermediates(images, intermediates_only=True)  # type: ignore[operator]
+        return torch.cat([each.mean((2, 3)) for each in maps], 1)
+
+
+def within(trunk: nn.Module) -> nn.Module:
+    """The timm model in a trunk from ``build_trunk``."""
+    while isinstance(trunk, PerFrame | Stages):
+        trunk = trunk.trunk
+    return trunk
 
 
 class PerFrame(nn.Module):

@@ -110,8 +110,14 @@ def load_weights(network: nn.Module, tensors: State, file: Path | str) -> None:
                 fitting[start] = state
                 break
             reasons.setdefault(start, (len(expected.keys() & state.keys()), why))
-    if len(fitting) != 1:
-        two = f"two sets of weights fit, below {' and '.join(map(repr, fitting))}"
+    # A whole set of names beside the one that fits is another network: nothing says which is meant.
+    rivals = [
+        start
+        for start in reasons
+        if fitting and start not in fitting and expected.keys() <= below(start, tensors).keys()
+    ]
+    if len(fitting) != 1 or rivals:
+        two = f"two sets of weights fit, below {' and '.join(map(repr, [*fitting, *rivals]))}"
         why = two if fitting else max(reasons.values(), key=lambda reason: reason[0])[1]
         name = _cfg(network).get("architecture", type(network).__name__)
         raise ValueError(f"{file} does not fit {name}: {why}")

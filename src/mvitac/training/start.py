@@ -11,7 +11,7 @@ from mvitac.data.pack import Pack
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, file_source, read_sources, unknown_source, weights_files
 from mvitac.methods.base import Method
 from mvitac.model import load
-from mvitac.nn.encoders import PerFrame
+from mvitac.nn.encoders import within
 from mvitac.nn.initial import Init
 from mvitac.nn.momentum import Momentum
 from mvitac.nn.weights import State, below, load_weights, misfit
@@ -47,10 +47,12 @@ def read_start(init: Init) -> Start | None:
 def load_trunk(trunk: nn.Module, state: State, file: Path | str = "it") -> None:
     """Load ``state``, the state dict of a trunk from ``build_trunk`` or timm, into another trunk (``load_weights``).
 
-    A trunk that sees a window's frames one by one, and one that sees a single image, take each other's weights.
-    ValueError, which names ``file``, if they are different networks; ``trunk`` is then unchanged.
+    How frames and stages are combined does not matter. ValueError, which names ``file``, if they are different networks;
+    ``trunk`` is then unchanged.
     """
-    load_weights(trunk.trunk if isinstance(trunk, PerFrame) else trunk, below("trunk.", state) or state, file)
+    while inside := below("trunk.", state):
+        state = inside
+    load_weights(within(trunk), state, file)
 
 
 def load_start(start: Start, method: Method) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from timm.optim import param_groups_layer_decay  # pyright: ignore[reportPrivate
 from torch import Tensor
 
 from mvitac.methods.base import Contrastive, Embeddings, Method, Views
-from mvitac.nn.encoders import Encoders, PerFrame
+from mvitac.nn.encoders import Encoders, within
 from mvitac.run import Optim, Run
 from mvitac.system.distributed import World
 
@@ -143,7 +143,7 @@ def _scales(method: Method, encoders: Encoders) -> dict[int, float]:
         scales |= dict.fromkeys(map(id, encoder.parameters()), config.lr_scale)
         if config.layer_decay == 1:
             continue
-        trunk = encoder.trunk if isinstance(encoder, PerFrame) else encoder
+        trunk = within(encoder)
         if not hasattr(trunk, "group_matcher"):
             raise ValueError(f"the trunk of {name} names no layers: leave out --encoder.{name}.layer-decay")
         # timm gives a trunk without its classifier's layer the full rate at the end; here the heads are that layer.

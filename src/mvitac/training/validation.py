@@ -196,7 +196,7 @@ def verdict(start: Cells, end: Cells, by: str) -> list[str]:
         said[word].append(text)
     found = [f"{word}: {', '.join(texts)}" for word, texts in said.items() if texts]
     if not found:
-        return ["split val has no labels of two classes, and no values: nothing says what the features are worth"]
+        return ["split val has no labels of two classes, and no values, that were not trained on: no verdict"]
     return [f"compared with the start (linear probe, points of accuracy or R2 on {by}s of val), {found[0]}", *found[1:]]
 
 

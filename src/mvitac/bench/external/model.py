@@ -106,6 +106,7 @@ class ExternalModel(Model):
         for modality in (m for m in spec.modalities if part.adapter.reads in (m, "both")):
             sensors = max(1, spec.channels(modality) // 3 // spec.frames(modality))
             self.parts[modality] = part.bound(sensors, spec.frames(modality))
+        self.alone: set[str] = set()  # modalities whose features were seen to be those of one image alone
         self.stored = stored or max(part.preprocessing.size)
         self.encoders = nn.ModuleDict(self.parts)
         self.projectors, self.classifiers, self.tasks, self.probes = nn.ModuleDict(), nn.ModuleList(), (), {}
@@ -180,6 +181,11 @@ class ExternalModel(Model):
         if not (found == 0).all() and not 1e-3 < found.abs().max() < 1e12:  # probes add 1e-6 to a standard deviation
             largest = f"features of {modality} up to {found.abs().max():.0e}"
             raise ValueError(f"{self.text} gives {largest}: scale them to about 1")
+        if len(images) > 2 and modality not in self.alone:  # once: a network in training mode, or with dropout
+            self.alone.add(modality)
+            fewer = self.encoders[modality](images[:2]).float()
+            if (fewer - found[:2]).abs().max() > 0.02 * found.abs().max():
+                raise ValueError(f"{self.text}: features of {modality} depend on the other images, or on chance")
         return found
 
     def features_key(self, modality: str) -> str:

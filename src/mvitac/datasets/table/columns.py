@@ -139,10 +139,11 @@ def read_controls(table: Manifest, columns: Iterable[str], labels: Sequence[Sequ
     return made
 
 
-def ungrouped(texts: Mapping[str, Sequence[str]], splits: Sequence[str]) -> str:
+def ungrouped(column: str | None, texts: Mapping[str, Sequence[str]], splits: Sequence[str]) -> list[str]:
     """Say that every row is its own group, and which texts repeat themselves in train and in test.
 
-    ``texts``: the cells of each column. Those that hold numbers, or other splits, are no names of objects.
+    ``column`` is that of the groups, of which nothing is said if no text does. ``texts``: the cells of each column. Those
+    that hold numbers, or other splits, are no names of objects.
     """
     found = []
     for name, cells in texts.items():
@@ -154,7 +155,6 @@ def ungrouped(texts: Mapping[str, Sequence[str]], splits: Sequence[str]) -> str:
         if both := test & {cell for cell, split in zip(cells, splits, strict=True) if split != "test"}:
             found.append(f"{name} {len(both)} of {len(test)}")
     shared = f" (of those in test, also in train: {listed(found, 6)})" if found else ""
-    return (
-        f"{UNGROUPED}, so every row is its own group: where rows show one object or recording, scores are too high and"
-        f" intervals too narrow{shared}"
-    )
+    why = f"column {column} has another value in each row" if column else "no --group was given"
+    wide = f"{why}, {UNGROUPED}: where rows show one object or recording, scores are too high and intervals too narrow"
+    return [] if column and not found else [wide + shared]

@@ -241,7 +241,7 @@ class Rows(Source):
             controls=controls,
             licence=config.licence,
             source=config.source_url or "not given",
-            notes=self._notes(table, group_by, assigned),
+            notes=self._notes(table, group_by, len({*groups}) == len(groups), assigned),
             difference=config.difference,
             crop={m: ", ".join(cuts[c] for c in own if c in cuts) for m, own in asked.items() if {*own} & {*cuts}},
         )
@@ -304,7 +304,7 @@ class Rows(Source):
         splits.check_sides(where, column, found, tasks, labels, len(set(groups)))
         return found
 
-    def _notes(self, table: Manifest, group_by: str, assigned: Sequence[str]) -> tuple[str, ...]:
+    def _notes(self, table: Manifest, group_by: str, single: bool, assigned: Sequence[str]) -> tuple[str, ...]:
         """What results say about logs, about how images are shown, and about groups that no column names."""
         notes = [*table.notes]
         notes += [f"{text} is the part of the images that is used, squeezed to a square" for text in self._config.crop]
@@ -314,14 +314,14 @@ class Rows(Source):
                 notes.append("{} has more than 8 bits: {:g} is black, {:g} white".format(column, *span))
         if group_by == "video":
             notes.append("no column says the groups, so frames of one video are one group")
-        if group_by == "row":
+        if single or group_by == "row":
             known = {*self._config.labels, *table.labels, self._split, self._sensor, *self._images}
             texts = {name: [row[name] for row in table.rows] for name in table.rows[0] if name not in known}
             for column in self._images:  # file names up to their last number
                 files = (os.path.splitext(os.path.basename(ref.path))[0] if ref else "" for ref in table.images[column])
                 if (stems := [re.sub(r"\d+\D*$", "", file) for file in files]) not in texts.values():
                     texts[f"names of {column} files"] = stems
-            notes.append(columns.ungrouped(texts, assigned))
+            notes += columns.ungrouped(None if group_by == "row" else group_by, texts, assigned)
         return tuple(notes)
 
     def _make_rows(
