@@ -132,11 +132,8 @@ def _of_run(model: Model, path: Path) -> dict[str, Any]:
 def _images_seen(model: Model, path: Path) -> int | None:
     """Steps x batch size, which is images of each modality. None if it started from weights, or rows are not known."""
     run, steps = model.run, model.run.steps
-    if (
-        {run.encoder[m].weights for m in model.encoders} != {SCRATCH}
-        or run.init.digest
-        or not (steps or (path / FILE).exists())
-    ):
+    started = run.init.digest or {run.encoder[m].weights for m in model.encoders} != {SCRATCH}
+    if started or not (steps or (path / FILE).exists()):
         return None
     if not steps:
         steps = run.num_steps(sum(len(source.ids) for source in read_sources(path) or ()))

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from tabulate import tabulate
 from tyro.conf import Positional
 
 from mvitac.bench.board import write_board
@@ -68,8 +69,10 @@ def bench(argv: list[str]) -> None:
     if options.suite in loop.shipped():
         with shown():
             path = loop.run_suite(options.models, loop.find_suite(options.suite), options.out, options.about)
-        loop.print_result(path)
-        print(f"written: {path}")
+        own, value = loop.read_control(path)
+        for condition, (columns, rows) in loop.tables(own, [value]).items():
+            print(f"{own.name}, {condition}\n{tabulate(rows, columns)}\n")
+        print(f"{loop.note(own, [value])}\nwritten: {path}")
         return
     suite = find_suite(options.suite)
     with shown():

@@ -83,12 +83,11 @@ def export(argv: list[str]) -> None:
 
 
 def _rows(report: dict[str, Any]) -> list[list[str]]:
-    rows = [
-        [f"{t}, accuracy %", *(f"{v[k]:.1f}" for k in ("original", "export"))] for t, v in report["accuracy"].items()
-    ]
+    both = ("original", "export")
+    rows = [[f"{t}, accuracy %", *(f"{v[k]:.1f}" for k in both)] for t, v in report["accuracy"].items()]
     for target in (target for targets in report["values"].values() for target in targets):
         if target["num"]:
-            cells = (f"{target[key]:.3g}" for key in ("original", "export"))
+            cells = (f"{target[key]:.3g}" for key in both)
             rows.append([f"{target['name']}, mean absolute error, {target['unit']}", *cells])
         rows.append([f"{target['name']}, change, {target['unit']}", "", f"{target['change']:.2g}"])
     rows += [[f"{name}, lowest cosine", "", f"{values['min']:.5f}"] for name, values in report["cosine"].items()]

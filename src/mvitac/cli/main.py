@@ -41,15 +41,8 @@ COMMANDS = {
 """Command -> module of this package:function, imported when called."""
 
 OWN = (
-    ".safetensors",
-    ".npy",
-    ".onnx",
-    ".pt",
-    "samples.parquet",
-    "run.json",
-    "pack.json",
-    "export.json",
-    "artifact.json",
+    *(".safetensors", ".npy", ".onnx", ".pt", "samples.parquet"),
+    *("run.json", "pack.json", "export.json", "artifact.json"),
 )
 HEAVY = ("demo", "pretrain", "finetune", "compare", "bench")
 """Commands whose options need torch. The others import it once their options are known to be right."""

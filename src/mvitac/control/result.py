@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tabulate import tabulate
 
 from mvitac.bench.encoder import About, measure
 from mvitac.bench.result import problems_of, read_signed
@@ -150,21 +149,12 @@ def _cell(suite: Suite, known: Scored, source: str, key: tuple[str, str]) -> str
 
 def note(suite: Suite, values: Sequence[dict[str, Any]]) -> str:
     """What stands beside the tables."""
-    same = [value["data"] == suite.pins for value in values]
-    pins = [f"{v['encoder']['name']} {'same' if one else 'others'}" for v, one in zip(values, same, strict=True)]
+    pins = [f"{v['encoder']['name']} {'same' if v['data'] == suite.pins else 'others'}" for v in values]
     return (
         f"{suite.note}. * differs from the untrained trunks: the 95 % interval of the difference, paired by shape or"
         " episode, and over seeds, excludes 0. It leaves out the seeds of a row with one, and is not corrected for the"
         f" number of cells. Pixels that are learned from, beside the suite's own: {', '.join(pins)}."
     )
-
-
-def print_result(path: Path) -> None:
-    """Print the tables of one result."""
-    suite, value = read_control(path)
-    for condition, (columns, rows) in tables(suite, [value]).items():
-        print(f"{suite.name}, {condition}\n{tabulate(rows, columns)}\n")
-    print(note(suite, [value]))
 
 
 def write_page(files: Sequence[Path], out: Path) -> Path:

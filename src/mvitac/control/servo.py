@@ -19,7 +19,6 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from mvitac.sim import gel
-from mvitac.sim.coordinates import grid
 from mvitac.sim.relief import KINDS, Relief, draw_tables
 from mvitac.sim.sensors import SENSORS
 
@@ -191,7 +190,7 @@ class Copy:
 
     def press(self, height_mm: Callable[[np.ndarray, np.ndarray], np.ndarray], rng: np.random.Generator) -> np.ndarray:
         """What it sees, uint8 [64, 64, 3], of heights in mm above the apex of its gel, by place in mm."""
-        x, y, pixel = grid(SIZE, FIELD_MM)
+        x, y, pixel = gel.grid(SIZE, FIELD_MM)
         indent = height_mm(x, y) - (x * x + y * y) / (2 * DOME_MM)
         imprint = gel.relax(np.clip(indent, 0, 2.5).astype(np.float32), pixel_mm=pixel)
         return gel.render(imprint, self.sensor, rng, pixel_mm=pixel, size=SIZE, unit=self.unit, gain=self.gain)
@@ -223,8 +222,7 @@ def _near(task: Any, shape: Shape, asked: np.ndarray, along: float) -> np.ndarra
     state = task.state(shape, task.target, 0.0)
     for _ in range(max(0, round(along / STEP_MM))):
         state = task.moved(shape, state, task.target - task.pose(shape, state))
-    change = asked - task.pose(shape, state)
-    there = task.moved(shape, state, change)
+    there = task.moved(shape, state, asked - task.pose(shape, state))
     return task.moved(shape, there, asked - task.pose(shape, there))
 
 

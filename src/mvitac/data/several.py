@@ -69,9 +69,8 @@ class MixedPack(_Several):
         self.size = size or max(pack.size for pack in packs)
         self.digests = {name: pack.digest for name, pack in parts.items()} | {"size": digest(self.size)}
         other = {name: pack.size for name, pack in parts.items() if pack.size != self.size}
-        notes = [
-            f"{name}: images of {px} px are resized to {self.size} px as they are read" for name, px in other.items()
-        ]
+        how = f"px are resized to {self.size} px as they are read"
+        notes = [f"{name}: images of {px} {how}" for name, px in other.items()]
         if found := _shared_by_parts(parts):
             if not allow_leak:
                 raise ValueError(f"{found}: pack them with splits that agree, leave a part out, or give allow_leak")
@@ -175,11 +174,10 @@ def _mixed_spec(parts: Mapping[str, Pack], tasks: Mapping[str, Tasks], notes: Se
     every = list({task.name: task for own in tasks.values() for task in own.values()}.values())
     units = {spec.group_by for spec in specs.values()}
     controls: dict[str, tuple[str, ...]] = {}
-    for part, name, columns in (
-        (p, name, columns) for p, spec in specs.items() for name, columns in spec.controls.items()
-    ):
-        alike = all(spec.controls.get(name, columns) == columns for spec in specs.values())
-        controls[name if alike else f"{part}/{name}"] = columns
+    for part, spec in specs.items():
+        for name, columns in spec.controls.items():
+            alike = all(other.controls.get(name, columns) == columns for other in specs.values())
+            controls[name if alike else f"{part}/{name}"] = columns
     return DataSpec(
         name=f"mix of {', '.join(specs)}",
         vision_channels=max(spec.vision_channels for spec in specs.values()),

@@ -204,11 +204,6 @@ class Calandra(Source):
         return samples
 
 
-def _number(file: Path) -> int:
-    """The number in the name of a shard, which matches ``SHARD``."""
-    return int(file.stem[-3:])
-
-
 def find_shards(path: Path) -> list[Path]:
     """Return the shards in folder ``path``."""
     files = sorted(file for file in path.glob("*.h5") if SHARD.fullmatch(file.name))
@@ -225,7 +220,7 @@ def list_grasps(file: Path) -> list[Grasp]:
         with h5py.File(file) as opened:
             data: Any = opened["data"]
             indices = sorted(int(name[1:]) for name in data if re.fullmatch(r"i\d+", name))
-            return [_describe(data, Grasp(file, _number(file), index)) for index in indices]
+            return [_describe(data, Grasp(file, int(file.stem[-3:]), index)) for index in indices]
     except (OSError, KeyError, RuntimeError, TypeError) as error:  # h5py raises these for damaged files
         raise ValueError(f"{file} cannot be read ({brief(error)}): download it again, or remove it") from None
 

@@ -9,7 +9,6 @@ More than half of the folders are copies of others, some with slip.txt and some 
 content of their videos. If copies disagree, the recording has no label and label_conflict = 1.
 """
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -45,12 +44,12 @@ class SlipGSMiniConfig(RowsConfig):
 
     def manifest(self) -> Manifest:
         root = in_clone(self.path, "docs", "**/exp_num_*/camera_0.avi", self.source_url)
-        copies: dict[str, list[Path]] = {}
+        copies: dict[tuple[str, ...], list[Path]] = {}
         for first in sorted(root.glob("**/exp_num_*/camera_0.avi")):
             folder = first.parent
             if all((folder / name).is_file() for name in FINGERS.values()):
-                both = "".join(digest_file(folder / name) for name in FINGERS.values())
-                copies.setdefault(hashlib.sha256(both.encode()).hexdigest(), []).append(folder)
+                both = tuple(digest_file(folder / name) for name in FINGERS.values())
+                copies.setdefault(both, []).append(folder)
         rows: list[dict[str, str]] = []
         for folders in copies.values():
             rows += self._recording(root, folders)

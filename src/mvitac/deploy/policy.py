@@ -72,10 +72,8 @@ class ObservationEncoder(nn.Module):
 
         Images are normalised in here, as for ``forward``, so the policy must not do it again.
         """
-        return self._each(
-            observation,
-            lambda trunk, images: trunk.forward_intermediates(images, indices=1, intermediates_only=True)[0],
-        )
+        last: Any = {"indices": 1, "intermediates_only": True}
+        return self._each(observation, lambda trunk, images: trunk.forward_intermediates(images, **last)[0])
 
     def _each(self, observation: Mapping[str, Tensor], network: Callable[[Any, Tensor], Tensor]) -> dict[str, Tensor]:
         """What ``network`` makes of each modality's trunk and normalised images, [B, ...] or [B, T, ...]."""

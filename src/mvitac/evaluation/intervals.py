@@ -67,7 +67,7 @@ def paired_difference(
         either method was trained with one seed: the variation between seeds is then unknown, and the interval leaves it
         out. With a single group p is 1.
     """
-    ours, theirs = _by_seed(ours), _by_seed(theirs)
+    ours, theirs = (sorted(r, key=lambda one: -1 if one.get("seed") is None else one["seed"]) for r in (ours, theirs))
     assert len({str(_sizes(r).tolist()) for r in (*ours, *theirs)}) == 1, "scored on different test rows"
     (sizes, a), (_, b) = _counts(ours), _counts(theirs)
     mean = float((a.sum(1).mean() - b.sum(1).mean()) / sizes.sum())
@@ -102,10 +102,6 @@ def least_p(num_groups: int) -> float:
 def num_groups_of(record: dict[str, Any]) -> int:
     """Number of test groups that a record scored."""
     return int(np.count_nonzero(_sizes(record)))
-
-
-def _by_seed(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    return sorted(records, key=lambda record: -1 if record.get("seed") is None else record["seed"])
 
 
 def _sizes(record: dict[str, Any]) -> np.ndarray:

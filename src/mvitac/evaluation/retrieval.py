@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from mvitac.data.pack import Pack
 from mvitac.evaluation import diagnostics
@@ -13,13 +12,6 @@ from mvitac.evaluation.probe import group_numbers
 from mvitac.model import Model
 
 MIN_GALLERY = 11  # least number of test groups; with fewer, the first five are half of all groups or more
-
-
-def shared_space(model: Model, pack: Pack, rows: np.ndarray) -> dict[str, Tensor]:
-    """Projections [len(rows), E] of each modality into the space that they share, on the CPU."""
-    device = next(model.parameters()).device
-    z = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in ("touch", "vision")}
-    return {m: model.project(m, x.to(device)).cpu() for m, x in z.items()}
 
 
 def retrieved_rows(pack: Pack, *splits: str) -> np.ndarray:
@@ -37,11 +29,13 @@ def cross_modal(model: Model, pack: Pack) -> list[dict[str, Any]]:
     if len(model.projectors) < 2 or len(pack.spec.modalities) < 2:
         return []
     rows = retrieved_rows(pack, "test")
-    sizes = np.bincount(group_numbers(pack, rows))
+    groups = torch.from_numpy(group_numbers(pack, rows))
+    sizes = np.bincount(groups.numpy())
     if len(sizes) < MIN_GALLERY:
         return []
-    z, groups = shared_space(model, pack, rows), torch.from_numpy(group_numbers(pack, rows))
-    records = []
+    device, records = next(model.parameters()).device, []
+    x = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in ("touch", "vision")}
+    z = {m: model.project(m, each.to(device)).cpu() for m, each in x.items()}
     for query, gallery in (("vision", "touch"), ("touch", "vision")):
         ranks = diagnostics.retrieval_ranks(z[query], z[gallery], groups)
         hits = np.bincount(groups.numpy(), weights=(ranks < 5).numpy(), minlength=len(sizes)).astype(int)

@@ -49,12 +49,8 @@ def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
     the probabilities of the folds' probes do not compare.
     """
     keys = ("source", "seed", "task", "modality", "probe")
-    found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for records in folds:
-        for record in records:
-            found.setdefault(tuple(record[key] for key in keys), []).append(record)
     pooled = []
-    for parts in found.values():
+    for parts in grouped([record for records in folds for record in records], keys):
         if len(parts) < len(folds):
             continue
         whole = pool_values(parts) if "group_sums" in parts[0] else _pool_classes(parts)
@@ -64,6 +60,14 @@ def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
             whole["clipped"] = clipped
         pooled.append({**{key: parts[0][key] for key in keys}, **whole})
     return pooled
+
+
+def grouped(records: Sequence[dict[str, Any]], keys: Sequence[str]) -> list[list[dict[str, Any]]]:
+    """Lists of the records that have the same values of ``keys``."""
+    found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for record in records:
+        found.setdefault(tuple(record[key] for key in keys), []).append(record)
+    return list(found.values())
 
 
 def _pool_classes(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -86,11 +90,8 @@ def _pool_classes(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def pool_retrieval(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Pool the retrieval records of folds into one for each source, seed and direction: means over all queries."""
-    found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for record in records:
-        found.setdefault(tuple(record[key] for key in ("source", "seed", "direction")), []).append(record)
     pooled = []
-    for parts in found.values():
+    for parts in grouped(records, ("source", "seed", "direction")):
         weights = [sum(part["group_sizes"]) for part in parts]
         rates = {k: float(np.average([p[k] for p in parts], weights=weights)) for k in parts[0] if "R@" in k}
         lists = {k: [n for part in parts for n in part[k]] for k in ("group_sizes", "group_correct")}

@@ -21,7 +21,7 @@ import numpy as np
 from mvitac.data.pack import Pack
 from mvitac.data.spec import MODALITIES, AnyTask, Task
 from mvitac.datasets.base import DatasetConfig
-from mvitac.evaluation.controls import IMAGENET_SIDE, imagenet_trunk
+from mvitac.evaluation.controls import IMAGENET_SIDE, Records, imagenet_trunk
 from mvitac.evaluation.diagnostics import mean_error
 from mvitac.evaluation.evaluate import ProbeConfig, check_unseen, chosen
 from mvitac.evaluation.features import features, fitting
@@ -43,7 +43,6 @@ from mvitac.transforms.random_views import Augment, ViewAugment
 TUNED, FROZEN, SCRATCH = "fine-tuned", "frozen, linear probe", "from scratch"
 LIGHT = ViewAugment(scale=(0.8, 1.0), flip=0.0, grayscale=0.0)
 OPTIM = Optim(name="adamw", lr=1e-3, eps=1e-8, weight_decay=0.05, decay_norms=False, schedule="cosine", warmup=0.1)
-Records = list[dict[str, Any]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,11 +122,9 @@ def finetune(
     records = [record for own, _ in found.values() for record in own]
     result = {
         **{"data": pack.spec.name, "pack": pack.digest, "ancestor": str(ancestor), "group_by": pack.spec.group_by},
-        **{
-            "notes": list(pack.spec.notes),
-            "leaks": [*leaks_of(records), *mark_split_leaks(pack, records)],
-            "records": records,
-        },
+        "notes": list(pack.spec.notes),
+        "leaks": [*leaks_of(records), *mark_split_leaks(pack, records)],
+        "records": records,
         "chosen": {f"{percent:g}": settings for percent, (_, settings) in found.items()},
         "models": [str(job.folder(asked.fractions[-1]) / f"seed{seed}") for seed in range(asked.seeds)],
     }

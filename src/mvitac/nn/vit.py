@@ -165,7 +165,8 @@ class Predictor(nn.Module):
         """
         width = self.mask_token.shape[3]
         positions = sin_cos_positions(*seen.grid, width, hidden.device)
-        known = _placed(self.embed(seen.values), seen.at, positions)
+        front = seen.values.shape[1] - seen.at.shape[1]
+        known = self.embed(seen.values) + F.pad(positions[seen.at], (0, 0, front, 0))
         num_sets, length = hidden.shape[1:]
         masked = (self.mask_token + positions[hidden]).to(known.dtype)
         tokens = torch.cat([known[:, None].expand(-1, num_sets, -1, -1), masked], dim=2).flatten(0, 1)
@@ -175,8 +176,3 @@ class Predictor(nn.Module):
             shown = torch.cat([seen.live[:, None].expand(-1, num_sets, -1), live], dim=2).flatten(0, 1)
         predicted = _pass(self.blocks, tokens, shown)[:, -length:]
         return self.out(self.norm(predicted)).unflatten(0, (-1, num_sets))
-
-
-def _placed(tokens: Float[Tensor, "B F+K D"], at: Int[Tensor, "B K"], positions: Float[Tensor, "N D"]) -> Tensor:
-    """``tokens`` plus the position of each that is a patch."""
-    return tokens + F.pad(positions[at], (0, 0, tokens.shape[1] - at.shape[1], 0))

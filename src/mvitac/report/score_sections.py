@@ -4,20 +4,8 @@ from typing import Any
 
 from markupsafe import Markup
 
-from mvitac.evaluation.score_text import (
-    MODALITY_ORDER,
-    WORDS,
-    clipped_text,
-    columns_of,
-    error_text,
-    headline,
-    percent,
-    score_name,
-    score_rows,
-    sources_of,
-    tested_on,
-    with_interval,
-)
+from mvitac.evaluation import score_text
+from mvitac.evaluation.score_text import columns_of, error_text, percent, score_name, sources_of, with_interval
 from mvitac.evaluation.scores import by_cell, summarise_again
 from mvitac.report import figures, tables
 from mvitac.report.html import MODALITY_HUES
@@ -64,11 +52,12 @@ def _scores(study: Study, summary: dict[str, Any]) -> list[Markup]:
     parts = []
     for score in ("accuracy", "R2"):
         tasks = {task: found for task, found in summary.items() if score_name(found) == score}
-        columns = [m for m in MODALITY_ORDER if any(m in columns_of(found) for found in tasks.values())]
+        columns = [m for m in score_text.MODALITY_ORDER if any(m in columns_of(found) for found in tasks.values())]
         rows, muted = [], set()
         for task, found in tasks.items():
             order = sources_of(found)
-            rows += [[f"{task} ({tested_on(found, study.pack.spec.group_by)})"], *score_rows(found, columns)]
+            about = score_text.tested_on(found, study.pack.spec.group_by)
+            rows += [[f"{task} ({about})"], *score_text.score_rows(found, columns)]
             muted |= set(order) - set(study.sources)
         if rows:
             parts.append(html.table([f"{score} %", *columns], rows, muted=muted, label=score))
@@ -86,7 +75,7 @@ def _target_table(study: Study, task: str, found: dict[str, Any]) -> Markup:
         rows.append([source, *(text for pair in zip(score, error, strict=True) for text in pair)])
     heads = [head for m in columns_of(found) for head in (f"{m}: R2 %", "mean absolute error")]
     table = html.table([task, *heads], rows, muted={*sources_of(found)} - {*study.sources}, label=f"{task}: targets")
-    return table + (html.paragraph(f"{clipped}.") if (clipped := clipped_text(found)) else "")
+    return table + (html.paragraph(f"{clipped}.") if (clipped := score_text.clipped_text(found)) else "")
 
 
 def _per_class(study: Study) -> list[Markup]:
@@ -95,7 +84,8 @@ def _per_class(study: Study) -> list[Markup]:
     for task, modality, sources, classes in tables.classes_of(study.result):
         heads = ["class", "rows", "groups", *(f"{source}: precision / recall" for source in sources)]
         table = html.table(heads, tables.class_rows(classes, sources), label=f"{task}: classes")
-        found.append(html.fold(f"Every class of {task}, by {WORDS[modality]}: precision and recall (%)", table))
+        title = f"Every class of {task}, by {score_text.WORDS[modality]}: precision and recall (%)"
+        found.append(html.fold(title, table))
     return found
 
 
@@ -107,13 +97,13 @@ def values(study: Study) -> list[Markup]:
     for task, found in study.result["summary"].items():
         if score_name(found) == "accuracy":
             continue
-        modality, own, _ = headline(found, study.sources[0], study.sources)
+        modality, own, _ = score_text.headline(found, study.sources[0], study.sources)
         mine = cells[task, modality, study.sources[0]]
         for t, target in enumerate(own["targets"]):
             name = target["name"] if target["name"] == task else f"{task}: {target['name']}"
             hue, unit = MODALITY_HUES[modality], target["unit"]
             points = [pair for record in mine for pair in record["points"][t]]
-            drawing = figures.predicted(f"{name}, {WORDS[modality]}", points, unit, hue)
+            drawing = figures.predicted(f"{name}, {score_text.WORDS[modality]}", points, unit, hue)
             text = f"R2 {percent(target['mean'])} %, mean absolute error {error_text(target)}; {len(points)} test rows"
             text += f" of {len(mine)} seeds." if len(mine) > 1 else "."
             drawn.append(study.figure(f"predicted {name}", drawing, f"Predicted against true {name}. {text}", text))

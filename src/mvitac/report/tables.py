@@ -6,26 +6,12 @@ from typing import Any, TextIO
 
 from tabulate import tabulate
 
+from mvitac.evaluation import score_text
 from mvitac.evaluation.intervals import interval, paired_difference
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import VALUE_PROBES
-from mvitac.evaluation.score_text import (
-    WORDS,
-    clipped_text,
-    columns_of,
-    covered,
-    error_text,
-    headline,
-    methods_of,
-    percent,
-    score_name,
-    score_rows,
-    sources_of,
-    tested_on,
-    verdicts,
-    with_interval,
-)
-from mvitac.evaluation.scores import leaks_in
+from mvitac.evaluation.score_text import columns_of, error_text, headline, percent, sources_of, with_interval
+from mvitac.evaluation.scores import grouped, leaks_in
 
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
 VALUE_PROBE_NAMES = {"linear": "ridge regression"}
@@ -54,20 +40,20 @@ def print_summary(result: dict[str, Any], file: TextIO | None = None, *, probe: 
     trained, by, few = [], result["group_by"], 10
     for name, task in result["summary"].items():
         trained += [{"source": s, "seed": seed} for m in task.values() for s, v in m.items() for seed in v["seeds"]]
-        modalities, score = columns_of(task), score_name(task)
+        modalities, score = columns_of(task), score_text.score_name(task)
         seeds = max((len(v["seeds"]) for m in task.values() for v in m.values()), default=0)
         few = min(v["groups"] for m in (*task.values(), {"": {"groups": few}}) for v in m.values())
-        about = f"{probe_name(probe, score)}; {seeds} seed{'s' * (seeds != 1)}; {tested_on(task, by)}"
+        about = f"{probe_name(probe, score)}; {seeds} seed{'s' * (seeds != 1)}; {score_text.tested_on(task, by)}"
         title = f"{result['data']}: {name} ({about})"
         # LEAK on a line of its own, else the table is too wide.
-        rows = [[cell.replace(" LEAK", "\nLEAK") for cell in row] for row in score_rows(task, modalities)]
+        rows = [[cell.replace(" LEAK", "\nLEAK") for cell in row] for row in score_text.score_rows(task, modalities)]
         print(text_table(title, [f"{score} %", *modalities], rows).rstrip(), file=file)
-        for line in verdicts(task):
+        for line in score_text.verdicts(task):
             print(textwrap.fill(line, 80, subsequent_indent="  "), file=file)
         print(file=file)
         if score == "R2":
             print(_targets(name, task), file=file)
-        if clipped := clipped_text(task):
+        if clipped := score_text.clipped_text(task):
             print(textwrap.fill(clipped, 80, subsequent_indent="  "), file=file)
     _print_notes(result, trained, file)
     if 1 < few < 10 and result.get("asked", {}).get("folds") == 0:  # of probe
@@ -77,7 +63,7 @@ def print_summary(result: dict[str, Any], file: TextIO | None = None, *, probe: 
 
 def _print_notes(result: dict[str, Any], records: Sequence[dict[str, Any]], file: TextIO | None) -> None:
     """Print what the intervals of ``records`` cover, and what limits the result."""
-    said = f"95 % intervals: {covered(result['group_by'], records)}."
+    said = f"95 % intervals: {score_text.covered(result['group_by'], records)}."
     print(textwrap.fill(said, 80, subsequent_indent="  "), file=file)
     for kind, key in (("note", "notes"), ("LEAK", "leaks")):
         for text in result.get(key, ()):
@@ -99,7 +85,7 @@ def classes_of(result: dict[str, Any]) -> Iterator[tuple[str, str, list[str], li
     The sources are the methods, the untrained trunk and the pixels.
     """
     for task, found in result.get("per_class", {}).items():
-        methods = methods_of(result["summary"][task])
+        methods = score_text.methods_of(result["summary"][task])
         modality = headline(result["summary"][task], methods[0], methods)[0] if methods else "touch"
         if classes := found.get(modality):
             yield task, modality, [s for s in (*methods, "untrained", "pixels") if s in classes[0]["scores"]], classes
@@ -114,7 +100,7 @@ def class_rows(classes: Sequence[dict[str, Any]], sources: Sequence[str]) -> lis
 def print_classes(result: dict[str, Any], file: TextIO | None = None) -> None:
     """Print precision and recall of each class, a table per task; of several methods in several tables."""
     for task, modality, sources, classes in classes_of(result):
-        title = f"{task} by {WORDS[modality]}: precision / recall of each class, %"
+        title = f"{task} by {score_text.WORDS[modality]}: precision / recall of each class, %"
         for start in range(0, len(sources), NUM_BESIDE):
             some = sources[start : start + NUM_BESIDE]
             rows = class_rows([{**c, "class": c["class"][:16]} for c in classes], some)
@@ -145,10 +131,10 @@ def print_retrieval(result: dict[str, Any], file: TextIO | None = None) -> None:
 def retrieval_rows(records: Sequence[dict[str, Any]]) -> list[list[str]]:
     """Rows of source, direction and ``RETRIEVAL`` in percent, averaged over seeds."""
     rows = []
-    for (source, direction), found in by_direction(records).items():
+    for found in grouped(records, ("source", "direction")):
         mark = leak_mark(leaks_in(found))
-        rows.append([source, direction, *(percent(recall(found, key)) + mark for key in RETRIEVAL[:-1])])
-        rows[-1].append(percent(recall(found, RETRIEVAL[-1])))
+        *scores, chance = (percent(recall(found, key)) for key in RETRIEVAL)
+        rows.append([found[0]["source"], found[0]["direction"], *(score + mark for score in scores), chance])
     return rows
 
 
@@ -157,14 +143,6 @@ def recall(records: Sequence[dict[str, Any]], key: str) -> float:
     if key == "R@5":
         return interval(records)[0]
     return sum(r[key] for r in records) / len(records)
-
-
-def by_direction(records: Sequence[dict[str, Any]]) -> dict[tuple[str, str], list[dict[str, Any]]]:
-    """(source, direction) -> the retrieval records of its seeds."""
-    found: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for record in records:
-        found.setdefault((record["source"], record["direction"]), []).append(record)
-    return found
 
 
 def print_finetuning(result: dict[str, Any], file: TextIO | None = None) -> None:

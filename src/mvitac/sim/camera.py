@@ -18,9 +18,7 @@ from mvitac.sim import objects
 from mvitac.sim.physics import Bench
 
 SAMPLES = 2  # rays per pixel along each axis
-
 TABLES = ("plain", "checker", "planks", "marble", "dots")
-
 VISIBLE = np.array([1, 1, 1, 0, 0, 0], np.uint8)
 """Geom groups that the camera sees; the collision bars of the fingers are not drawn."""
 
@@ -47,7 +45,9 @@ class View:
         self.ambient = rng.uniform(0.18, 0.45)
         self.exposure = rng.uniform(0.75, 1.25)
         self.table = str(rng.choice(TABLES))
-        self.table_colors = _pair(rng)
+        color = rng.uniform(0.25, 0.85) * rng.normal(1, 0.12, 3)
+        related = color * rng.uniform(0.7, 1.3) + rng.normal(0, 0.03, 3)
+        self.table_colors = np.clip([color, related], 0.02, 0.95)
         self.table_turn = rng.uniform(0, np.pi)
         self.table_scale = rng.uniform(0.02, 0.07)
         self.wall_colors = rng.uniform(0.05, 0.85, (3, 3))  # bottom, top, and a soft stain
@@ -73,12 +73,6 @@ def _clutter(azimuth: float, rng: np.random.Generator) -> np.ndarray:
         pose[3:] = rng.normal(size=4)
         pose[3:] /= np.linalg.norm(pose[3:])
     return poses
-
-
-def _pair(rng: np.random.Generator) -> np.ndarray:
-    """Draw two related colours [2, 3]."""
-    color = rng.uniform(0.25, 0.85) * rng.normal(1, 0.12, 3)
-    return np.clip([color, color * rng.uniform(0.7, 1.3) + rng.normal(0, 0.03, 3)], 0.02, 0.95)
 
 
 def photograph(bench: Bench, view: View, rng: np.random.Generator, *, size: int) -> np.ndarray:

@@ -26,13 +26,10 @@ from mvitac.sim.sensors import Pair, Sensor
 
 F = NDArray[Any]  # float32 [H, W] unless said otherwise; numpy's stubs lose the width on the way
 GEL_STIFFNESS = 0.06  # Winkler modulus of the gel in N/mm^3: about 0.2 MPa over 3 to 4 mm
-
 MEMBRANE_MM = (0.12, 0.35, 0.9)
 """Radii over which the membrane bridges gaps (set by eye, from the halo around real imprints)."""
-
 MEMBRANE_SAG = 0.8
 """Relative height of the bridge: the gel behind pushes the membrane into the gap, so shallow grooves remain visible."""
-
 _TAG = 0x6E1
 
 
@@ -97,23 +94,20 @@ def render(
     rng: np.random.Generator,
     *,
     pixel_mm: float,
+    unit: int,
     shear_mm: Pair = (0.0, 0.0),
     size: int | None = None,
-    unit: int | None = None,
     gain: float = 1.0,
 ) -> NDArray[np.uint8]:
     """Render an imprint [H, W] in mm as a sensor sees it: uint8 [h, w, 3].
 
     Args:
-        rng: Random generator of camera noise, and of the unit if `unit` is None.
+        rng: Random generator of camera noise.
+        unit: Number of a physical copy of the sensor with its own dots, dirt, scratches and tint.
         shear_mm: Displacement (x, y) of the dots inside the contact.
         size: Side of the picture, h = w; default: (H, W).
-        unit: Number of a physical copy of the sensor with its own dots, dirt, scratches and tint. Give it to render
-            several pictures with the same copy.
         gain: Factor of the colour response to slope (LED current, paint).
     """
-    if unit is None:
-        unit = int(rng.integers(2**31))
     # A copy has the same properties at every size.
     copy, paint = np.random.default_rng([_TAG, *sensor.name.encode(), unit]).spawn(2)
     imprint = imprint_mm.astype(np.float32)
@@ -268,6 +262,15 @@ def _blur(surface: F, sigma_px: float) -> F:
     """Blur [H, W] by about `sigma_px` with two box filters, whose cost does not depend on the radius."""
     width = max(3, 2 * round(sigma_px * 1.22) + 1)
     return uniform_filter(uniform_filter(surface, width, mode="nearest"), width, mode="nearest")
+
+
+def grid(size: int, width_mm: float) -> tuple[F, F, float]:
+    """Return x, y [n, n] in mm and mm per pixel of the internal picture, which is twice as fine if `size` is small."""
+    n = 2 * size if size <= 96 else max(192, size)
+    pixel = width_mm / n
+    axis = (np.arange(n, dtype=np.float32) - (n - 1) / 2) * np.float32(pixel)
+    x, y = np.meshgrid(axis, axis)
+    return x, y, pixel
 
 
 @lru_cache(maxsize=16)

@@ -20,19 +20,13 @@ from mvitac.sim.sensors import SENSORS
 
 VERSION = 2
 NUM_OBJECTS = 106
-
 FIELD_MM = 22.0  # width of a gel's field of view
-
 GRID = 144  # smallest number of samples across a gel, because the relief is finer than the pixels of a small picture
-
 SHEAR_MM_PER_N = 0.35
 SHEAR_LIMIT_MM = 1.2
-
 FAR = 0.25  # fraction of grips that miss the centre of mass
-
 EXPECTED_FRICTION = 0.5
 """The hand knows the weight of an object, not its friction; it presses as hard as this friction needs."""
-
 BEHIND_M = 3.0  # rays start this far behind the pad, so that they are parallel to within 0.2 degrees
 
 # One random stream per purpose, so that sensor and picture size do not affect physics and camera.
@@ -91,7 +85,8 @@ def grasp(
         for side, name, touch in ((0, "left", moment.left), (1, "right", moment.right)):
             imprint, contacts = _pressed(bench, patch, moment, side, max(GRID, size), measured)
             copy: Any = {"unit": units[side], "gain": gain, "pixel_mm": FIELD_MM / len(imprint)}
-            row[f"touch_{name}"] = gel.render(imprint, sensor, touch_rng, shear_mm=_drag_mm(touch), size=size, **copy)
+            x, y = (SHEAR_LIMIT_MM * float(np.tanh(n * SHEAR_MM_PER_N / SHEAR_LIMIT_MM)) for n in touch.shear_n)
+            row[f"touch_{name}"] = gel.render(imprint, sensor, touch_rng, shear_mm=(x, y), size=size, **copy)
             row[f"contact_{name}"] = float(imprint.mean())
             row[f"normal_{name}_n"] = touch.normal_n
             row |= {side_name(known_as, name): value for known_as, value in contacts.items()}
@@ -104,12 +99,6 @@ def grasp(
 @lru_cache(maxsize=4)
 def _bench(seed: int, obj: int) -> physics.Bench:
     return physics.Bench(objects.make_thing(seed, obj))
-
-
-def _drag_mm(touch: physics.Touch) -> tuple[float, float]:
-    """Return how far the shear force drags the gel along x and y."""
-    x, y = (SHEAR_LIMIT_MM * float(np.tanh(n * SHEAR_MM_PER_N / SHEAR_LIMIT_MM)) for n in touch.shear_n)
-    return x, y
 
 
 def _latents(thing: objects.Thing, patch: skin.Patch, plan: physics.Plan) -> dict[str, float]:

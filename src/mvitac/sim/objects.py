@@ -16,19 +16,12 @@ from mvitac.sim.skin import Finish
 
 OBJECT_TAG = 0x0B1EC7
 """First word of the seed sequence of object properties. Grasps use other tags, because trailing zeros are ignored."""
-
 PAD_HALF_M = 0.0115  # half the side of a gel pad
-
 DOME_RADIUS_MM = 20.0  # radius of curvature of the gels, in the physics and in the optics
-
 PAD_DEPTH_M = PAD_HALF_M**2 / (DOME_RADIUS_MM / 1000)  # half depth of the ellipsoid with this radius at its apex
-
 FINGER_M = (0.006, 0.009, 0.036)  # half sizes of a finger's bar: thickness, width, height
-
 OPEN_M = 0.047  # distance of an open pad's apex from the hand's axis
-
 MASS_KG = 0.25, 0.7  # smallest and largest mass of an object
-
 CLUTTER = (("box", ".03 .02 .04"), ("sphere", ".028"), ("cylinder", ".022 .045"), ("capsule", ".015 .05"))
 """MuJoCo types and sizes of the clutter."""
 
@@ -139,10 +132,8 @@ def _single(shape: str, *ranges: tuple[float, float], lying: bool = False) -> Ca
 def _hammer(rng: np.random.Generator) -> tuple[Part, ...]:
     r, h, x, y, z = _mm(rng, (11, 16), (45, 65), (16, 22), (7, 11), (15, 20))
     side = rng.choice([-1, 1])
-    return (
-        Part("cylinder", (r, h), (0, 0, z), lying=True),
-        Part("box", (x, y, z), (0, side * (h + y), z), density=rng.uniform(1.0, 1.3)),
-    )
+    head = Part("box", (x, y, z), (0, side * (h + y), z), density=rng.uniform(1.0, 1.3))
+    return Part("cylinder", (r, h), (0, 0, z), lying=True), head
 
 
 def _mug(rng: np.random.Generator) -> tuple[Part, ...]:
@@ -166,11 +157,9 @@ def _tee(rng: np.random.Generator) -> tuple[Part, ...]:
 def _dumbbell(rng: np.random.Generator) -> tuple[Part, ...]:
     r, h, left, right = _mm(rng, (10, 15), (28, 48), (17, 28), (17, 28))
     z = max(left, right)
-    return (
-        Part("capsule", (r, h), (0, 0, z), lying=True),
-        Part("cylinder", (z, left / 2), (0, -h, z), lying=True, density=rng.choice([1.0, 1.5])),
-        Part("cylinder", (z, right / 2), (0, h, z), lying=True),
-    )
+    first = Part("cylinder", (z, left / 2), (0, -h, z), lying=True, density=rng.choice([1.0, 1.5]))
+    second = Part("cylinder", (z, right / 2), (0, h, z), lying=True)
+    return Part("capsule", (r, h), (0, 0, z), lying=True), first, second
 
 
 _DRAW = {

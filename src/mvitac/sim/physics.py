@@ -16,12 +16,9 @@ from mvitac.sim import gel, objects
 
 STEP_S = 0.002
 CHUNK = 5  # time steps between changes of the set points
-
 SETTLE_S, CLOSE_S, LIFT_S, HOLD_S = 0.10, 0.30, 0.36, 0.24
 CLOSE_SPEED = 0.14  # metres per second of each finger
-
 HELD_PART = 0.7  # an object is lifted if its centre of mass has risen by this fraction of the hand's path
-
 RUNAWAY = 30.0  # a velocity (m/s or rad/s) that occurs only if the solver diverges
 
 

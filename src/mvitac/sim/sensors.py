@@ -168,11 +168,8 @@ def _random_sensor(seed: int, number: int) -> Sensor:
     plain = ("saturation", "shadow", "dirt", "scratches", "edge", "noise")
     values: dict[str, Any] = {name: float(within(getattr(s, name) for s in known)) for name in plain}
     values |= {name: float(within(getattr(s, name) for s in known if s.marker_pitch_mm)) for name in dots}
-    pairs: Any = [
-        np.stack([np.maximum(height, 10.0), *place], 1),
-        tilt,
-        strength[:, None] * np.c_[np.cos(angle), np.sin(angle)],
-    ]
+    towards = strength[:, None] * np.c_[np.cos(angle), np.sin(angle)]
+    pairs: Any = [np.stack([np.maximum(height, 10.0), *place], 1), tilt, towards]
     glow, tilts, response = (cast(Any, tuple(map(tuple, rows.tolist()))) for rows in pairs)
     base = tuple(base.tolist())
     return Sensor(name=f"random{number:04d}", base=base, glow=glow, tilt=tilts, response=response, **values)

@@ -12,9 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 PATTERNS = ("ribs", "knurl", "grain", "bumps")
-
 PEAKS = 0.76  # fraction of patches with peaks
-
 GRIPS, SLIDES = 0.85, 0.3  # friction coefficients against the gel for peaks and for pits
 
 

@@ -91,8 +91,7 @@ def time_offset(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     if len(curves) < 3:
         return cannot(f"{len(curves)} ordered sequences of {2 * MAX_LAG + 2} rows or more, 3 are needed")
     mean, error = curves.mean(0), curves.std(0, ddof=1) / len(curves) ** 0.5
-    lag = int(mean.argmax()) - MAX_LAG
-    best = lag + MAX_LAG
+    lag = (best := int(mean.argmax())) - MAX_LAG
     if mean[best] < 0.3 or mean[best] < 3 * error[best]:  # streams of other recordings gave up to .25
         return cannot(f"motion in vision and touch is unrelated (at best r = {mean[best]:.2f} at lag {lag})")
     gain = curves[:, best] - curves[:, MAX_LAG]

@@ -12,6 +12,7 @@ has all episodes in one group, and their ends (exclusive) in meta/episode_ends.
 
 from collections.abc import Collection, Sequence
 from itertools import accumulate
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,7 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
             everything = _datasets(opened)
             for name in _demonstrations(file, everything, images):
                 demo = "/".join(filter(None, (file.stem if len(files) > 1 or not name else "", name)))
-                datasets = _datasets(_at(opened, name))
+                datasets = _datasets(opened[name] if name else opened)
                 refs = _images(file, name, datasets, images, MAX_ROWS - len(rows))
                 num = len(next(iter(refs.values())))
                 cells = _constants(opened, name, vectors)
@@ -194,15 +195,11 @@ def _is_text(data: Any) -> bool:
     return h5py.check_string_dtype(data.dtype) is not None
 
 
-def _at(opened: Any, name: str) -> Any:
-    return opened[name] if name else opened
-
-
 def _constants(opened: Any, name: str, vectors: Collection[str]) -> dict[str, list[str]]:
     """Return the attributes of group ``name`` and of those above it; the nearest counts. Long texts are left out."""
     cells: dict[str, list[str]] = {}
     # From group to group: the path of each from the root would take minutes where there are thousands.
-    for group in accumulate(name.split("/") if name else [], _at, initial=opened):
+    for group in accumulate(name.split("/") if name else [], getitem, initial=opened):
         for column, value in group.attrs.items():
             plain = np.asarray(value).tolist()
             plain = plain[0] if isinstance(plain, list) and len(plain) == 1 else plain

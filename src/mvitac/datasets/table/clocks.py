@@ -104,9 +104,8 @@ def join(
             _check_apart(file, times[at], [recordings[i] for i in at])
             stamps = seconds(log.filled(column, "time"), f"{file}, column {column}") + shift
             if len(back := np.flatnonzero(np.diff(stamps) < -0.1)) not in (0, len(stamps) - 1):  # s
-                raise ValueError(
-                    f"{file}: the clock goes back after row {back[0] + 1}: mend it, or sort the rows by time"
-                )
+                where = f"{file}: the clock goes back after row {back[0] + 1}"
+                raise ValueError(f"{where}: mend it, or sort the rows by time")
             same += len(stamps) - (distinct := len(np.unique(stamps)))
             apart += len({(at, *row.values()) for at, row in zip(stamps, log.rows, strict=True)}) - distinct
             cells, largest = joined(log, stamps, times[at], (numbers if linear else ()), tolerance)

@@ -10,7 +10,7 @@ import os
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -221,8 +221,4 @@ def _read_jsonl(file: Path) -> list[dict[str, Any]]:
     return rows
 
 
-READERS: dict[str, Callable[[Path], list[dict[str, Any]]]] = {
-    ".csv": _read_csv,
-    ".parquet": _read_parquet,
-    ".jsonl": _read_jsonl,
-}
+READERS = {".csv": _read_csv, ".parquet": _read_parquet, ".jsonl": _read_jsonl}
