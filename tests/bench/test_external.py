@@ -21,6 +21,7 @@ from mvitac.evaluation.features import features
 from mvitac.evaluation.probe import probe_model
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.model import fresh
+from mvitac.nn.encoders import within
 from mvitac.recipes import recipe
 from support.toy import toy_pack
 
@@ -56,13 +57,14 @@ def test_random_weights_for_the_control_leave_the_encoder_as_it_is(weights: Path
     assert open_model(TINY).untrained() is None
 
 
-def test_the_same_network_gives_the_same_features_as_in_a_run(pack: Pack, tmp_path: Path) -> None:
+@pytest.mark.parametrize("pool", ["last", "stages"])
+def test_the_same_network_gives_the_same_features_as_in_a_run(pack: Pack, tmp_path: Path, pool: str) -> None:
     run = recipe("smoke", PackConfig(path=pack.path))
-    run = replace(run, encoder=run.encoder.changed(trunk="test_resnet"))
+    run = replace(run, encoder=run.encoder.changed(trunk="test_resnet", pool=pool))
     ours = fresh(replace(run, augment=replace(run.augment, size=32, whole=None)), pack.spec, pack.size)
     trunk = ours.encoders["touch"]
-    torch.save(trunk.state_dict(), tmp_path / "trunk.pth")
-    text = f"external:timm/test_resnet,weights={tmp_path / 'trunk.pth'},size=32"
+    torch.save(within(trunk).state_dict(), tmp_path / "trunk.pth")
+    text = f"external:timm/test_resnet,weights={tmp_path / 'trunk.pth'},size=32,pool={pool}"
     theirs, same = open_model(text).on(pack)
     assert same is pack
     own, expected = (features(model, pack, "touch", ROWS) for model in (theirs, ours))

@@ -32,7 +32,7 @@ from timm.data.constants import IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD
 from torch import Tensor, nn
 
 from mvitac.nn import imagenet
-from mvitac.nn.encoders import IMAGENET, SCRATCH, EncoderConfig, build_trunk
+from mvitac.nn.encoders import IMAGENET, SCRATCH, EncoderConfig, build_trunk, within
 from mvitac.nn.weights import said_trained_on
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.system.files import brief
@@ -117,6 +117,8 @@ class Timm(Adapter):
 
     weights: str = "pretrained"
     """pretrained (timm downloads them), random, or a file."""
+    pool: Literal["last", "stages"] = "last"
+    """Features: those of the model, or the means of the maps of all its stages (``EncoderConfig.pool``)."""
 
     def load(self) -> Loaded:
         if self.place.endswith(".openai") and "quickgelu" not in self.place:
@@ -124,14 +126,14 @@ class Timm(Adapter):
             raise ValueError(f"{self.place}: OpenAI's weights need QuickGELU: {quick}")
         known = {"pretrained": IMAGENET, "random": SCRATCH}
         network = seeded(partial(self._built, known.get(self.weights, self.weights)), self.seed)
-        cfg: dict[str, Any] = getattr(network, "pretrained_cfg", None) or {}
+        cfg: dict[str, Any] = getattr(within(network), "pretrained_cfg", None) or {}
         usual = resolve_data_config(pretrained_cfg={"name": self.place, **cfg})
         random, named, file = self.weights == "random", self.weights in known, Path(self.weights)
         page = f"https://huggingface.co/{cfg.get('hf_hub_id')}"
         return Loaded(
             network,
             Preprocessing(size=usual["input_size"][1:], mean=usual["mean"], std=usual["std"]),
-            f"{self.place}, {self.weights if named else file.name}",
+            f"{self.place}, {self.weights if named else file.name}" + ", all stages" * (self.pool == "stages"),
             files=() if named else (file,),
             licence=RANDOM if random else (named and cfg.get("license")) or UNKNOWN,
             source=imagenet.source(self.place) or page if self.weights == "pretrained" else self.weights,
@@ -139,10 +141,10 @@ class Timm(Adapter):
         )
 
     def _built(self, weights: str) -> nn.Module:
-        trunk = build_trunk(EncoderConfig(trunk=self.place, weights=weights), 3)
-        if self.size and hasattr(trunk, "set_input_size"):
+        trunk = build_trunk(EncoderConfig(trunk=self.place, weights=weights, pool=self.pool), 3)
+        if self.size and hasattr(model := within(trunk), "set_input_size"):
             try:
-                trunk.set_input_size(img_size=(self.size, self.size))  # type: ignore[operator]
+                model.set_input_size(img_size=(self.size, self.size))  # type: ignore[operator]
             except Exception as error:  # each model has its own rules
                 raise ValueError(f"{self.place} cannot take size {self.size} ({brief(error)})") from None
         return trunk
