@@ -181,8 +181,8 @@ class ExternalModel(Model):
         if not (found == 0).all() and not 1e-3 < found.abs().max() < 1e12:  # probes add 1e-6 to a standard deviation
             largest = f"features of {modality} up to {found.abs().max():.0e}"
             raise ValueError(f"{self.text} gives {largest}: scale them to about 1")
-        if len(images) > 2 and modality not in self.alone:  # once: a network in training mode, or with dropout
-            self.alone.add(modality)
+        if not self.training and len(images) > 2 and modality not in self.alone:
+            self.alone.add(modality)  # once: BatchNorm or dropout may still be that of training
             fewer = self.encoders[modality](images[:2]).float()
             if (fewer - found[:2]).abs().max() > 0.02 * found.abs().max():
                 raise ValueError(f"{self.text}: features of {modality} depend on the other images, or on chance")
