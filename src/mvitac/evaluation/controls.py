@@ -163,7 +163,8 @@ def frozen_trunks(runs: Sequence[Run]) -> list[tuple[str, Run]]:
     """The pre-trained trunks to probe as they are, by name: ImageNet's, and files that ``runs`` started from.
 
     ImageNet is left out where no weights are installed or cached (``imagenet.source``). It sees images as large as the
-    runs do, and at least ``IMAGENET_SIDE``. Other people's encoders alone have no such row.
+    runs do, and at least ``IMAGENET_SIDE``, and gives all stages for both senses if the runs have those of one. Other
+    people's encoders alone have no such row.
     """
     # The heads of SimCLR are not read; it takes any trunk and modality.
     runs = [replace(run, method=SimCLRConfig()) for run in runs]
@@ -174,7 +175,9 @@ def frozen_trunks(runs: Sequence[Run]) -> list[tuple[str, Run]]:
         views = runs[0].augment
         sides = {m: max(views.whole_of(m), IMAGENET_SIDE) for m in MODALITIES}
         views = replace(views, **{m: replace(views.of(m), whole=side) for m, side in sides.items()})
-        found.append(("imagenet", replace(runs[0], encoder=Encoders(vision=vision, touch=touch), augment=views)))
+        encoder = Encoders(vision=vision, touch=touch)
+        encoder = encoder.changed(pool="stages") if "stages" in (vision.pool, touch.pool) else encoder
+        found.append(("imagenet", replace(runs[0], encoder=encoder, augment=views)))
     return found[::-1]
 
 
