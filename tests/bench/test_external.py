@@ -101,6 +101,7 @@ def test_sensors_are_encoded_one_by_one(pack: Pack, tmp_path: Path) -> None:
 
 
 FACTORY = """
+import torch
 from torch import nn
 
 class Net(nn.Module):
@@ -136,6 +137,19 @@ def zero():
     net = Net()
     nn.init.zeros_(net.conv.weight)
     return net, {"size": 16}
+
+def complex():
+    return type("FFT", (nn.Module,), {"forward": lambda self, x: torch.fft.fft(x.mean((2, 3)))})(), {"size": 16}
+
+def late():
+    late = {"forward": lambda self, x: x.flatten(1).requires_grad_()[:, : 9 * len(x)]}
+    return type("Late", (nn.Module,), late)(), {"size": 16}
+
+def exits():
+    raise SystemExit(0)
+
+def levels():
+    return Net(), {"mean": (123, 117, 104)}
 
 def bare():
     return Net()
@@ -176,15 +190,20 @@ def test_python_functions(pack: Pack, functions: str) -> None:
         open_model(f"{functions}nan").on(pack)[0].features("touch", images)
     with pytest.raises(ValueError, match="batch: features of touch depend on the other images, or on chance"):
         open_model(f"{functions}batch").on(pack)[0].features("touch", images)
+    with pytest.raises(ValueError, match="late: features of touch depend on the other images"):
+        open_model(f"{functions}late").on(pack)[0].features("touch", images)
     with pytest.raises(ValueError, match=f"features of touch are the same for all {pack.num} images"):
         features(open_model(f"{functions}zero").on(pack)[0], pack, "touch", np.arange(pack.num))
     keys = [open_model(f"{functions}{name}").on(pack)[0] for name in ("tokens", "same", "same")]
     assert len({net.features_key("touch") for net in keys}) == 3 and len({net.weights_digest() for net in keys}) == 2
     for name, words in (
         ("bare", "no torch module and dict"),
+        ("exits", "no torch module and dict"),
+        ("levels", "images are in 0 to 1"),
+        ("complex", "of torch.complex64 for two images"),
         ("wrong", "'sides'"),
         ("six", "does not take images"),
-        ("nothing", r"nets_here:nothing: .*returns \[2, 0\] for two images"),
+        ("nothing", r"nets_here:nothing: .*returns \[2, 0\] of torch"),
         ("no", "has no attribute 'no'"),
     ):
         with pytest.raises(ValueError, match=words):

@@ -5,8 +5,10 @@ read. A window never crosses the edge of a touch (column touch_group, else group
 """
 
 import copy
+import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -111,12 +113,15 @@ def places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
     name = window.order or next((column for column in ORDER if column in pack.table.column_names), None)
     if name is None:
         raise ValueError(f"{pack.spec.name!r} has none of the columns {', '.join(ORDER)}: name its order, --data.order")
-    cells = pack.column(name)
-    try:
-        place = cells.astype(float)
-    except (TypeError, ValueError):
-        place = np.full(pack.num, np.nan)
+    place = np.array([_number(cell) for cell in pack.column(name)])
     if not np.isfinite(place).all():
         row = int(np.flatnonzero(~np.isfinite(place))[0])
         raise ValueError(f"frames: column {name!r} is not a number in row {row}: give all rows one, or another order")
     return name, place
+
+
+def _number(cell: Any) -> float:
+    try:
+        return float(cell)
+    except (TypeError, ValueError):
+        return math.nan

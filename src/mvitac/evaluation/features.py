@@ -94,6 +94,6 @@ def pack_features(
     chunks = []
     for chunk in np.array_split(rows, max(1, len(rows) // size)):
         images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
-        chunks.append(model.features(modality, images, for_heads=for_heads, bf16=bf16).cpu())
+        chunks.append(model.features(modality, images, for_heads=for_heads, bf16=bf16).detach().cpu())
         advance(len(chunk))
     return torch.cat(chunks)

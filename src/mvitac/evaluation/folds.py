@@ -1,6 +1,6 @@
 """Folds for small sets: every group is tested once, by probes fitted on the others.
 
-Groups that a run learned from, also without their labels, are always fitted on and never tested.
+Groups that a run learned from, by any row, image or name, also without labels, are always fitted on and never tested.
 """
 
 from collections.abc import Sequence
@@ -9,9 +9,9 @@ import numpy as np
 from sklearn.model_selection import StratifiedGroupKFold
 
 from mvitac.data.pack import Pack
-from mvitac.data.row_hashes import row_hashes
+from mvitac.data.row_hashes import known_images, row_hashes
 from mvitac.data.spec import AnyTask, ValueTask
-from mvitac.evaluation.leaks import Source
+from mvitac.evaluation.leaks import KEYS, Source
 
 
 def fold_splits(pack: Pack, task: AnyTask, num: int, learned: Sequence[Source]) -> list[np.ndarray]:
@@ -21,7 +21,10 @@ def fold_splits(pack: Pack, task: AnyTask, num: int, learned: Sequence[Source]) 
     ``num`` groups were not ``learned`` from.
     """
     known = pack.answered(task) & np.isin(pack.column(task.split), ("train", "val", "test"))
-    seen = np.isin(row_hashes(pack)[1], np.concatenate([[np.uint64(0)], *(source.groups for source in learned)]))
+    ids, names = row_hashes(pack)
+    of = {key: np.concatenate([[np.uint64(0)], *(getattr(source, key) for source in learned)]) for key in KEYS}
+    copied = np.isin(ids, of["ids"]) | known_images(pack, np.arange(pack.num), of["images"][1:]).any(axis=1)
+    seen = np.isin(names, np.concatenate([of["groups"], names[copied]]))
     rows = np.flatnonzero(known & ~seen)
     groups = pack.column("group")[rows].astype(str)
     if (left := len(set(groups))) < num:

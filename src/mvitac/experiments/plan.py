@@ -75,6 +75,10 @@ class Plan:
         labels = [row.label for row in self.rows]
         if not 1 <= self.seeds <= 1000:
             raise ValueError(f"seeds {self.seeds}: give 1 to 1000")
+        if any("seed" in given for given in (self.set, *(row.set for row in self.rows))):
+            raise ValueError("seed: runs have the seeds 0 .. seeds - 1, give their number")
+        if not all(slug(label) for label in labels):
+            raise ValueError(f"plan {self.name!r}: a row has no label of letters or digits")
         if taken := sorted(set(labels) & set(CONTROLS)):
             raise ValueError(f"row {taken[0]!r} has the name of a control: give it another label")
         if len({slug(label) for label in labels}) < len(labels):

@@ -13,7 +13,7 @@ from tabulate import tabulate
 
 from mvitac.evaluation.intervals import least_p, num_groups_of
 from mvitac.evaluation.score_text import covered, error_text, percent, pipes, with_interval
-from mvitac.experiments.plan import Plan
+from mvitac.experiments.plan import Plan, dotted
 from mvitac.experiments.table import Line, as_printed, lines_of, plan_of, target_lines
 from mvitac.report.tables import RETRIEVAL, probe_name, retrieval_rows
 from mvitac.system.files import write_atomic, write_json
@@ -145,6 +145,11 @@ def _budget(result: dict[str, Any]) -> str:
     text = "budgets differ (see cost)"
     if len(budgets) == 1:
         text = "equal budget: every run saw {} pairs in {} steps".format(*budgets.pop())
+    sets = {row.label: [name for name, _ in dotted(row.set)] for row in plan_of(result).rows}
+    begun = [
+        label for label, names in sets.items() if any(n.startswith("init") or n.endswith("weights") for n in names)
+    ]
+    text += f"; not counted is what the weights that {', '.join(begun)} started from had seen" * bool(begun)
     same_rows = len({c["pairs_of"] for c in result["cost"]}) < 2
     return text if same_rows else f"{text}, **pairs are not from the same rows (see cost)**"
 

@@ -61,6 +61,9 @@ class Preprocessing:
         if min(*self.size, self.frames) < 1 or not 0 < min(self.stride, *self.std) < math.inf:
             raise ValueError(f"size {self.size}, frames {self.frames}, stride {self.stride}, std {self.std}: 0 or less")
 
+        if not all(0 <= level <= 1 for level in self.mean):
+            raise ValueError(f"mean {self.mean}: images are in 0 to 1")
+
     def __call__(self, images: Tensor) -> Tensor:
         """Prepare images [N, F, 3, H, W], uint8 or float in [0, 1], newest first.
 
@@ -165,7 +168,7 @@ class Python(Adapter):
         try:
             made: Any = seeded(getattr(importlib.import_module(module), name), self.seed)
             network, given = made[0], dict(made[1])
-        except Exception as error:  # whatever the module raises, or returns
+        except (Exception, SystemExit) as error:  # whatever the module raises, or returns
             why = f"{type(error).__name__}: {brief(error)}"
             raise ValueError(f"{self.place}() returns no torch module and dict ({why}): give module:function") from None
         finally:

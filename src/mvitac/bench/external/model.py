@@ -46,9 +46,11 @@ class ExternalEncoder(nn.Module):
         try:
             with torch.no_grad():
                 found = self.network(torch.zeros(2, *shape))
-            if found.ndim != 2 or len(found) != 2 or not found.shape[1]:
-                raise ValueError(f"it returns {list(found.shape)} for two images, not [2, D]")
-        except Exception as error:  # whatever the network raises
+            if found.ndim != 2 or len(found) != 2 or not found.shape[1] or found.is_complex():
+                raise ValueError(
+                    f"it returns {list(found.shape)} of {found.dtype} for two images, not [2, D] of floats"
+                )
+        except (Exception, SystemExit) as error:  # whatever the network raises
             why = f"the network does not take images {list(shape)} ({brief(error)})"
             raise ValueError(f"{adapter.place}: {why}: give its size and frames") from None
         self.num_features = self.width = found.shape[1]
@@ -175,7 +177,10 @@ class ExternalModel(Model):
         return made
 
     def _encode(self, modality: str, images: Tensor, for_heads: bool) -> Tensor:
-        found = self.encoders[modality](images).float()
+        try:
+            found = self.encoders[modality](images)
+        except Exception as error:  # whatever other people's code raises
+            raise ValueError(f"{self.text} fails on {len(images)} images of {modality} ({brief(error)})") from None
         if not torch.isfinite(found).all():
             raise ValueError(f"{self.text} gives NaN or infinite features of {modality}: check weights, mean and std")
         if not (found == 0).all() and not 1e-3 < found.abs().max() < 1e12:  # probes add 1e-6 to a standard deviation
@@ -183,8 +188,8 @@ class ExternalModel(Model):
             raise ValueError(f"{self.text} gives {largest}: scale them to about 1")
         if not self.training and len(images) > 2 and modality not in self.alone:
             self.alone.add(modality)  # once: BatchNorm or dropout may still be that of training
-            fewer = self.encoders[modality](images[:2]).float()
-            if (fewer - found[:2]).abs().max() > 0.02 * found.abs().max():
+            fewer = self.encoders[modality](images[:2])
+            if fewer.shape[1] != found.shape[1] or (fewer - found[:2]).abs().max() > 0.02 * found.abs().max():
                 raise ValueError(f"{self.text}: features of {modality} depend on the other images, or on chance")
         return found
 
