@@ -4,6 +4,8 @@ import csv
 import json
 import os
 import re
+import struct
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -321,6 +323,15 @@ def test_sixteen_bits_are_scaled_not_clipped(tmp_path: Path) -> None:
     Image.fromarray(np.zeros((9, 9, 3), np.uint8)).save(tmp_path / "rgb.png")
     with pytest.raises(ValueError, match="read as RGB of 8 bits"):
         decode(tmp_path / "rgb.png", span=(0, 2040))
+    parts = (
+        (b"IHDR", struct.pack(">IIBBBBB", 2, 2, 16, 2, 0, 0, 0)),
+        (b"IDAT", zlib.compress(bytes(26))),
+        (b"IEND", b""),
+    )
+    chunks = (struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in parts)
+    (tmp_path / "deep.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
+    with pytest.raises(ValueError, match="16 bits a colour"):
+        decode(tmp_path / "deep.png")
 
 
 def test_gray_palette_bilevel_and_alpha_become_rgb(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ from mvitac.experiments.cross_validation import lay_out_folds
 from mvitac.experiments.jobs import do_all
 from mvitac.experiments.plan import PLANS, Plan, Row, changed, find_plan, setting, slug
 from mvitac.experiments.table import as_printed, lines_of
-from mvitac.experiments.table_formats import _tabular, comma, latex, markdown, write_tables
+from mvitac.experiments.table_formats import _budget, _tabular, comma, latex, markdown, write_tables
 from mvitac.recipes import RECIPES, recipe
 from mvitac.registry import from_json
 from mvitac.system.locks import Busy, hold_lock
@@ -168,6 +168,7 @@ def test_methods_of_these_plans_see_equally_many_images(pack: Pack, name: str) -
         ('[[rows]]\nlabel = "a"', "unknown reference row 'MViTac'"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\ntau = 1', "unknown field in plan.rows 'tau'"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\n[[rows]]\nlabel = "A"', "two labels are one"),
+        ('reference = "a"\n[[rows]]\nlabel = "a"\nset = {seed = 3}', "runs have the seeds 0"),
         ('reference = "pixels"\n[[rows]]\nlabel = "pixels"', "row 'pixels' has the name of a control"),
     ],
 )
@@ -219,6 +220,9 @@ def test_result_and_tables_agree(done: tuple[Path, dict]) -> None:
     text = (out / "table.md").read_text()
     assert f"| MViTac | touch | {100 * touch['mean']:.1f} [" in text
     assert "equal budget: every run saw 64 pairs in 4 steps" in text and "LEAK" not in text
+    plan = json.loads((out / "result.json").read_text())["plan"]
+    plan["rows"][1]["set"] = {"init": "run"}
+    assert "is what the weights that colder started from had seen" in _budget({**result, "plan": plan})
     rows = list(csv.DictReader((out / "table.csv").read_text().splitlines()))
     assert len(rows) == sum(len(line.cells) for line in lines.values())
     found = next(r for r in rows if (r["row"], r["modality"], r["task"]) == ("colder", "both", "bright"))
