@@ -29,10 +29,10 @@ def pipes(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int = 2) -
 def with_interval(mean: float, low: float | None, high: float, leak: str = "") -> str:
     """A score and its 95 % interval, such as '57.6 [55.1, 60.2]', with LEAK if there is one (``evaluation.leaks``).
 
-    An interval of all possible scores (of one test group, R2 of two) is left out.
+    An interval of all possible scores (R2 of one or two test groups) is left out.
     """
     least, most = "-inf" if low is None or not math.isfinite(low) else percent(low), percent(high)
-    ends = "" if least in ("-inf", "0.0") and most == "100.0" else f" [{least}, {most}]"
+    ends = "" if least == "-inf" and most == "100.0" else f" [{least}, {most}]"
     return f"{percent(mean)}{ends}{leak_mark(leak)}"
 
 
