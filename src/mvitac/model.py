@@ -296,15 +296,8 @@ class Model(nn.Module):
 
     def features_key(self, modality: str) -> str:
         """Content address of what the features of ``modality`` depend on. Models that share a tower share it."""
-        encoder = self.run.encoder[modality]
-        kind = (
-            encoder.trunk,
-            encoder.temporal,
-            encoder.pool,
-            self.mean_std(modality),
-            self.image_sizes(modality)[0],
-            self.stored,
-        )
+        encoder, size = self.run.encoder[modality], self.image_sizes(modality)[0]
+        kind = encoder.trunk, encoder.temporal, encoder.pool, self.mean_std(modality), size, self.stored
         return digest([safetensors_digest(tensors_of(self.encoders[modality])), *kind])
 
     def save(self, path: Path, *, half: bool = False) -> None:

@@ -241,9 +241,6 @@ def test_a_record_with_a_field_of_the_wrong_type(refused: Callable[..., str], fi
         refused("pretrain --from {tmp}/run.json --out {out}", "run.json", leaf[-1])
 
 
-# -- files ------------------------------------------------------------------------------------------------------------
-
-
 def put(*keys: str, value: Any) -> Spoil:
     return lambda path: edited(path, keys, value)
 

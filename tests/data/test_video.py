@@ -153,9 +153,6 @@ def test_frames_come_as_they_are_decoded(made: dict[str, Path], count: dict[str,
     assert count["packets"] <= 2  # not a list of all in disguise
 
 
-# -- damage -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("harm", ["zeros", "noise", "bit"])
 def test_a_damaged_packet_costs_frames_up_to_the_next_key_frame(path: Path, tmp_path: Path, harm: str) -> None:
     good = dict(frames(path, range(NUM)))

@@ -211,9 +211,6 @@ def test_a_damaged_chunk_costs_its_own_rows(tmp_path: Path) -> None:
     assert levels(pack, "vision") == [i for i in range(20) if i not in (6, 7)]
 
 
-# -- zarr, and images that are no uint8 arrays ------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", ["v2", "v3", "zip"])
 def test_a_replay_buffer_in_zarr(tmp_path: Path, kind: str) -> None:
     """As diffusion policy writes it: all episodes in one group, their ends in meta/episode_ends."""

@@ -181,9 +181,6 @@ def test_lerobot_says_what_is_missing(tmp_path: Path) -> None:
     refused(root, r"file-001\.parquet cannot be read as a table")
 
 
-# -- values -----------------------------------------------------------------------------------------------------------
-
-
 def measured(pack: Pack) -> tuple[np.ndarray, np.ndarray]:
     """The targets of the only task with values, [N, T], and the rows' images in the order they were made [N]."""
     (task,) = pack.spec.values
@@ -225,9 +222,6 @@ def test_hub_and_manifests_read_values(tmp_path: Path) -> None:
         config = FolderConfig(path=tmp_path / f"m.{kind}", size=16, values=("p=pose[0]:mm,pose[2]:mm",))
         values, shown = measured(packed(config, tmp_path / kind))
         assert np.array_equal(values, np.stack([shown / 2, -shown / 4], axis=1)), kind
-
-
-# -- parquet of the hub -----------------------------------------------------------------------------------------------
 
 
 def make_hub(root: Path) -> Path:

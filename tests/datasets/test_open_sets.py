@@ -33,9 +33,6 @@ def level(image: np.ndarray) -> float:
     return float(image.mean())
 
 
-# -- the owners' layouts ----------------------------------------------------------------------------------------------
-
-
 def make_slip_grasp(root: Path) -> None:
     """4 objects, 3 to 4 grasps, 21 frames each; the words for the outcome and the infix differ as they do there."""
     for k in range(4):
@@ -138,9 +135,6 @@ def packs(clones: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, P
     return {name: build(c.source(), out / name, size=16, quiet=True) for name, c in configs.items()}
 
 
-# -- what every reader owes -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", SETS)
 def test_the_contract(packs: dict[str, Pack], clones: Path, name: str) -> None:
     pack = packs[name]
@@ -191,9 +185,6 @@ def test_frames_are_counted_and_spread(tmp_path: Path) -> None:
     (tmp_path / "b.mov").write_text("nothing")
     with pytest.raises(ValueError, match=r"b\.mov cannot be read as a video"):
         num_frames(tmp_path / "b.mov")
-
-
-# -- what each of them says -------------------------------------------------------------------------------------------
 
 
 def test_slip_grasp_labels_no_late_frame_where_early_ones_are_lost(tmp_path: Path) -> None:

@@ -47,9 +47,6 @@ def level(image: np.ndarray) -> float:
     return float(image.mean())
 
 
-# -- videos -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def films(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("films")
@@ -174,9 +171,6 @@ def test_a_bad_frame_costs_its_own_row_only(films: Path, tmp_path: Path) -> None
         assert abs(level(pack.images["touch"][i]) - shade(row["touch_frame"], row["take"] + 1)) < 6
 
 
-# -- gaps -------------------------------------------------------------------------------------------------------------
-
-
 def gappy(root: Path) -> Table:
     rows: Table = []
     for i in range(24):
@@ -210,9 +204,6 @@ def test_a_row_may_lack_a_modality(tmp_path: Path) -> None:
     for i, number in enumerate(numbers):
         assert (pack.images["vision"][i] == (10 + number) * pack.has("vision")[i]).all()
         assert (pack.images["touch"][i, :, :, 3:] == (200 + number) * pack.has("touch")[i]).all()
-
-
-# -- backgrounds and sensors ------------------------------------------------------------------------------------------
 
 
 def test_differences_are_halved_around_the_middle() -> None:

@@ -81,9 +81,6 @@ def test_each_frame_is_minus_the_first_one_of_its_touch(published: Path, model: 
         model.embed(touch=clip, background=first)
 
 
-# -- live -------------------------------------------------------------------------------------------------------------
-
-
 class Counter(Rig):
     """A sensor whose picture is its number of frames read; ``calls`` before 8 are the free sensor."""
 
@@ -160,9 +157,6 @@ def test_a_stream_keeps_no_more_than_a_window_needs() -> None:
         clock.now = 99 + k / 10
         stream.pump()
     assert 6 <= len(stream._past) <= 7 and stream._past[0][1].shape == (16, 16, 3)
-
-
-# -- the command line -------------------------------------------------------------------------------------------------
 
 
 def test_export_and_live_of_windows(

@@ -22,9 +22,6 @@ def record(correct: list[int], seed: int | None, sizes: int = 10) -> dict:
     return {"group_sizes": [sizes] * len(correct), "group_correct": correct, "seed": seed}
 
 
-# -- level ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("equal", [True, False], ids=["equal", "unequal"])
 @pytest.mark.parametrize("groups", [4, 8, 106, 240])
 @pytest.mark.parametrize("seeds", [1, 3])
@@ -122,9 +119,6 @@ def test_the_verdict_names_what_a_method_is_not_above() -> None:
         "cmc: not above a frozen ImageNet trunk beyond the intervals, by touch + vision",
     ]
     assert score_text.verdicts({"touch": {"mvitac": cell(0.5, 0.6)}}) == []  # --no-controls
-
-
-# -- worked cases -----------------------------------------------------------------------------------------------------
 
 
 def test_equal_groups_give_the_t_test() -> None:

@@ -28,9 +28,6 @@ NEWTON = (Target(name="force_n", unit="N"),)
 POSE = (Target(name="z_mm", unit="mm"), Target(name="tilt_deg", unit="deg"))
 
 
-# -- scores -----------------------------------------------------------------------------------------------------------
-
-
 def drawn(num: int = 300, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     y = rng.normal(3, 2, (num, 2))
@@ -90,9 +87,6 @@ def test_error_by_range_finds_where_predictions_are_wrong() -> None:
     ranges = record["targets"][0]["ranges"]
     assert all(part["mae"] == 0 for part in ranges if part["high"] < 6)
     assert ranges[-1]["bias"] < -1.3 and ranges[-1]["high"] == pytest.approx(8)
-
-
-# -- probes -----------------------------------------------------------------------------------------------------------
 
 
 def test_ridge_finds_a_linear_relation_in_any_unit_and_skips_what_was_not_measured() -> None:
@@ -186,9 +180,6 @@ def test_probes_of_classes_and_values_side_by_side(measured: Pack, tmp_path: Pat
     assert ("pattern", "mvitac", "touch", "paper") in found and ("pattern", "mean", "none", "linear") not in found
     shown = result["summary"]["light"]["touch"]["mvitac"]["mean"]
     assert shown == pytest.approx(found["light", "mvitac", "touch", "linear"]["r2"])
-
-
-# -- data -------------------------------------------------------------------------------------------------------------
 
 
 def test_packs_with_other_units_cannot_be_joined(measured: Pack) -> None:

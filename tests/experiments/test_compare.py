@@ -58,9 +58,6 @@ def done(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, di
     return out, result
 
 
-# -- plans ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", PLANS)
 @pytest.mark.parametrize("recipe_name", RECIPES)
 def test_every_row_of_every_plan_is_a_run(name: str, recipe_name: str) -> None:
@@ -444,9 +441,6 @@ def test_names_and_units_are_text_in_latex_and_markdown() -> None:
     assert pipes(["a|b"], [["c|d"]], words=1) == [r"| a\|b |", "|---|", r"| c\|d |", ""]
 
 
-# -- the command: killed and resumed, several at once -----------------------------------------------------------------
-
-
 def command(pack: Pack, plan: Path, out: Path, *more: str) -> list[str]:
     choice = ["--plan", str(plan), "--data", "pack", "--data.path", str(pack.path), "--out", str(out)]
     return ["compare", *choice, *more]
@@ -502,9 +496,6 @@ def test_the_command_from_dry_run_to_tables(pack: Pack, tmp_path: Path, capsys: 
     assert main([*words, "--set", "steps=1", "--tables-only", "--rows", "tau 0"]) == 0
     shown = capsys.readouterr().out
     assert "| tau 0 | touch |" in shown and "tau 1" not in shown
-
-
-# -- folds ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture

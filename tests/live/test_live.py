@@ -450,9 +450,6 @@ def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys:
     assert not list(tmp_path.glob("r.*"))  # nothing is in the way of the next try
 
 
-# -- values -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def measuring(value_onnx: Path) -> Engine:
     return Engine(value_onnx, threads=1)

@@ -69,9 +69,6 @@ def numbers(method: Method, batch: Views) -> dict[str, float]:
     return {name: value.item() for name, value in outcome(method, batch).items()}
 
 
-# -- MAE --------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("num", "ratio", "visible"), [(36, 0.75, 9), (196, 0.75, 49), (16, 0.4, 9), (4, 0.99, 1), (9, 0.01, 8)]
 )
@@ -107,9 +104,6 @@ def test_mae_is_the_mean_squared_error_of_hidden_patches(pixel_norm: bool) -> No
     for m, each in errors.items():
         assert found[m] == pytest.approx(np.mean(each), rel=1e-4)
     assert found["loss"] == pytest.approx(found["vision"] + found["touch"], rel=1e-5)
-
-
-# -- I-JEPA -----------------------------------------------------------------------------------------------------------
 
 
 def rectangle(at: list[int], width: int) -> tuple[int, int]:
@@ -195,9 +189,6 @@ def test_the_teacher_follows_with_a_linear_momentum() -> None:
     method.after_step(0.5)  # m = .75: a quarter of the way
     torch.testing.assert_close(teacher, torch.full_like(teacher, 1.25))  # type: ignore[arg-type]
     assert not any(p.requires_grad for p in method.teachers.parameters())
-
-
-# -- both -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", MASKED)

@@ -40,9 +40,6 @@ def auto(pack: Pack, **changes: object) -> Run:
     return smoke(pack, precision="auto", batch_size=4, eval_every=0, **changes)  # bf16 is slow where it is emulated
 
 
-# -- the choice -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("avx512_bf16", "amx", "onednn", "expected"),
     [
@@ -79,9 +76,6 @@ def test_auto_on_gpus(capability: tuple[int, int], expected: str, monkeypatch: p
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: including_emulation)
     assert Hardware.choose(torch.device("cuda:0"), "auto").precision == "fp32"
     assert Hardware.choose(torch.device("mps"), "auto").precision == "fp32"
-
-
-# -- said and kept ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("slower", [0.8, 0.95, 1.3])
@@ -135,9 +129,6 @@ def test_a_checkpoint_goes_on_in_its_own_precision_alone(pack: Pack, tmp_path: P
         train(replace(run, precision="fp32"), out, resume=True, quiet=True)
     train(run, out, resume=True, quiet=True)
     assert_equal_weights(tmp_path / "straight", out)
-
-
-# -- other commands ---------------------------------------------------------------------------------------------------
 
 
 def test_compare_says_where_runs_differ(pack: Pack, tmp_path: Path, hardware: Machine) -> None:

@@ -145,11 +145,8 @@ def problems(value: dict[str, Any]) -> list[str]:
     """What is missing in a result, or cannot be, in one line each: tasks, scores, controls, sums, data."""
     suite, encoder = suite_of(value), value["encoder"]
     found = list(problems_of(encoder, (*CONTROLS, GUESS)))
-    for fields, known in (
-        (value, FIELDS),
-        (value.get("about", {}), ABOUT),
-        *((block, BLOCK) for block in value["blocks"]),
-    ):
+    parts = [(value, FIELDS), (value.get("about", {}), ABOUT), *((block, BLOCK) for block in value["blocks"])]
+    for fields, known in parts:
         found += [f"has the unknown field {name!r}" for name in sorted(fields.keys() - {*known})]
     asked = [(one, ask) for one in suite.sets for ask in one.tasks]
     if (want := [(s.name, t.name) for s, t in asked]) != (have := [(b["set"], b["task"]) for b in value["blocks"]]):

@@ -163,7 +163,7 @@ def frozen_trunks(runs: Sequence[Run]) -> list[tuple[str, Run]]:
     """The pre-trained trunks to probe as they are, by name: ImageNet's, and files that ``runs`` started from.
 
     ImageNet is left out where no weights are installed or cached (``imagenet.source``). It sees images as large as the
-    runs do, and at least ``IMAGENET_SIDE``, and gives all stages for both senses if the runs have those of one. Other
+    runs do, and at least ``IMAGENET_SIDE``, and gives all stages for both senses if the first run has those of one. Other
     people's encoders alone have no such row.
     """
     # The heads of SimCLR are not read; it takes any trunk and modality.

@@ -111,11 +111,8 @@ def load_weights(network: nn.Module, tensors: State, file: Path | str) -> None:
                 break
             reasons.setdefault(start, (len(expected.keys() & state.keys()), why))
     # A whole set of names beside the one that fits is another network: nothing says which is meant.
-    rivals = [
-        start
-        for start in reasons
-        if fitting and start not in fitting and expected.keys() <= below(start, tensors).keys()
-    ]
+    others = [start for start in reasons if start not in fitting] if fitting else []
+    rivals = [start for start in others if expected.keys() <= below(start, tensors).keys()]
     if len(fitting) != 1 or rivals:
         two = f"two sets of weights fit, below {' and '.join(map(repr, [*fitting, *rivals]))}"
         why = two if fitting else max(reasons.values(), key=lambda reason: reason[0])[1]
@@ -210,7 +207,7 @@ def misfit(expected: State, found: dict[str, Any]) -> str:
         "missing": [name for name in expected if name not in found],
         "left over": [name for name in found if name not in expected],
         "of another shape": [f"{n} {[*a.shape]} for {[*b.shape]}" for n, a, b in both if a.shape != b.shape],
-        "of numbers that are no floats of 16 bits or more": [
+        "not of floats of 16 bits or more": [
             n for n, a, b in both if b.is_floating_point() and not (a.is_floating_point() and a.dtype.itemsize > 1)
         ],
     }

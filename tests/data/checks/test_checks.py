@@ -200,9 +200,6 @@ def test_classes_that_differ_in_spelling_only(pack: Pack) -> None:
         assert (f"classes of pattern: {alike}" == found.evidence) == bool(alike), found.evidence
 
 
-# -- the source and the pack --------------------------------------------------------------------------------------------
-
-
 def test_a_part_of_a_source_proves_no_class_unseen(tmp_path: Path) -> None:
     rows = ["touch,label,object,split"]
     for i in range(60):
@@ -276,9 +273,6 @@ def test_the_command_on_a_source(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "group (group): 1 of 20 in more than one split, e.g. 'g0'" in told["groups across splits"]["evidence"]
     assert main(["data", "check", str(tmp_path / "nothing")]) == 2
     assert "no pack at" in capsys.readouterr().err
-
-
-# -- the parts ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("late", [-3, 0, 2])

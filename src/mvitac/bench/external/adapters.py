@@ -60,7 +60,6 @@ class Preprocessing:
     def __post_init__(self) -> None:
         if min(*self.size, self.frames) < 1 or not 0 < min(self.stride, *self.std) < math.inf:
             raise ValueError(f"size {self.size}, frames {self.frames}, stride {self.stride}, std {self.std}: 0 or less")
-
         if not all(0 <= level <= 1 for level in self.mean):
             raise ValueError(f"mean {self.mean}: images are in 0 to 1")
 

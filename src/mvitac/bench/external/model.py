@@ -47,9 +47,8 @@ class ExternalEncoder(nn.Module):
             with torch.no_grad():
                 found = self.network(torch.zeros(2, *shape))
             if found.ndim != 2 or len(found) != 2 or not found.shape[1] or found.is_complex():
-                raise ValueError(
-                    f"it returns {list(found.shape)} of {found.dtype} for two images, not [2, D] of floats"
-                )
+                kind = f"{list(found.shape)} of {found.dtype}"
+                raise ValueError(f"it returns {kind} for two images, not [2, D] of floats")
         except (Exception, SystemExit) as error:  # whatever the network raises
             why = f"the network does not take images {list(shape)} ({brief(error)})"
             raise ValueError(f"{adapter.place}: {why}: give its size and frames") from None
