@@ -11,11 +11,13 @@ import mvitac
 from mvitac.data.pack import Pack
 from mvitac.deploy.export_module import ExportModule
 from mvitac.evaluation import features
+from mvitac.evaluation.controls import frozen_trunks
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, build_trunk, num_features, within
 from mvitac.nn.momentum import Momentum
+from mvitac.recipes import recipe
 from mvitac.run import Run
 from mvitac.training import setup
 from mvitac.training.loop import train
@@ -122,6 +124,8 @@ def test_features_of_all_stages() -> None:
     assert expected.shape[1] == num_features(trunk)
     other = build_trunk(replace(config, pool="last", temporal="stack"), 3)
     load_trunk(other, trunk.state_dict())
+    ((_, control),) = frozen_trunks([recipe("locked")])  # of both senses, as the run has them of one
+    assert {control.encoder[m].pool for m in ("vision", "touch")} == {"stages"}
     assert torch.equal(other.state_dict()["conv1.0.weight"], within(trunk).state_dict()["conv1.0.weight"])
 
 
