@@ -27,6 +27,7 @@ from mvitac.datasets.pack import ON_VAL, PackConfig
 from mvitac.deploy.publish import publish
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs, stored_result
 from mvitac.evaluation.leaks import (
+    CHOSE,
     DECLARED,
     FILE,
     NOT_SEEN,
@@ -166,6 +167,17 @@ def test_every_source_of_a_run_counts(pack: Pack, tmp_path: Path) -> None:
     leak = Scored(pack).leak(read, pack.rows("test"))
     assert leak.endswith("were trained on (before)") and "(toy)" not in leak
     assert leaks_of([{"source": "a", "task": "t", "leak": leak}] * 2) == [f"a, t: {leak}", NOT_SEEN]
+
+
+def test_a_list_is_that_of_its_run_and_of_its_weights(pack: Pack, tmp_path: Path) -> None:
+    val = pack.rows("val")
+    train(replace(smoke(pack), steps=1), tmp_path, quiet=True)
+    assert Scored(pack).leak(read_sources(tmp_path), val) == ""
+    leak = f"{len(val)} of {len(val)} test rows and "
+    assert (found := Scored(pack).leak(read_sources(tmp_path, "best"), val)).startswith(leak) and CHOSE in found
+    write_sources(tmp_path, [source_of(pack, pack.rows("test"))])  # of a run that saw other rows
+    with pytest.raises(ValueError, match="is of another run"):
+        read_sources(tmp_path)
 
 
 def test_numbers_mean_nothing_outside_their_dataset(pack: Pack) -> None:

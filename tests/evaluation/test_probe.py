@@ -25,10 +25,12 @@ from mvitac.evaluation import features as features_module
 from mvitac.evaluation.classifiers import fit_knn, fit_linear, fit_papers
 from mvitac.evaluation.controls import borders, controls_of, frozen_trunks, imagenet_trunk, starts_of, thumbnails
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.diagnostics import linear_probe
 from mvitac.evaluation.few_labels import few
 from mvitac.evaluation.folds import fold_splits
 from mvitac.evaluation.leaks import read_sources
 from mvitac.evaluation.probe import probe_all, probe_features, probe_model, split_rows
+from mvitac.evaluation.regressors import fit_ridge
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.run_names import names_of
 from mvitac.evaluation.score_text import verdicts
@@ -397,6 +399,19 @@ def test_classes_never_seen_get_probability_zero() -> None:
     x, y = np.array([[-1.0], [-0.9], [0.9], [1.0]]), np.array([0, 0, 2, 2])
     found = fit_linear(x, y, x, y, 4)[0](np.array([[1.0]]))[0]
     assert found[2] > found[0] > 0 and found[[1, 3]].tolist() == [0, 0] and found.sum() == pytest.approx(1)
+
+
+def test_the_scale_of_a_feature_does_not_matter_to_any_linear_probe() -> None:
+    rng = np.random.default_rng(0)
+    x, scales = rng.normal(size=(400, 12)).astype(np.float32), (10.0 ** rng.integers(-12, 9, 13)).astype(np.float32)
+    y = (x @ rng.normal(size=12) > 0).astype(int)
+    kept = np.hstack([x, np.full((400, 1), 0.1, np.float32)])  # one is constant
+    for fit in (
+        lambda z: fit_linear(z[:200], y[:200], z[200:300], y[200:300])[0](z[300:]),
+        lambda z: fit_ridge(z[:300], y[:300, None].astype(float), 100)[0](z[300:]),
+        lambda z: linear_probe(*map(torch.from_numpy, (z[:300], x[:300, :1], np.arange(300) // 4, z[300:]))).numpy(),
+    ):
+        assert np.allclose(fit(kept), fit(kept * scales), atol=1e-2) and fit(kept).std() > 0.1
 
 
 def modalities_of(runs: list[Run], spec: DataSpec) -> list[tuple[str, int]]:

@@ -201,7 +201,7 @@ def test_linear_probe_is_ridge_regression_with_a_chosen_strength(rows: int, widt
     weight = torch.randn(width, 2, generator=rng)
     groups = torch.arange(rows) // 4
     guess = d.linear_probe(x, x @ weight, groups, new)
-    scaled = ((x - x.mean(0)) / (x.std(0) + 1e-6)).double(), ((new - x.mean(0)) / (x.std(0) + 1e-6)).double()
+    scaled = ((x - x.mean(0)) / x.std(0)).double(), ((new - x.mean(0)) / x.std(0)).double()
     expected = [Ridge(alpha=a).fit(scaled[0], (x @ weight).double()).predict(scaled[1]) for a in d.ALPHAS]
     distances = [np.abs(guess.numpy() - each).max() for each in expected]
     assert min(distances) < 1e-3 < sorted(distances)[1]

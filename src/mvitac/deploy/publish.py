@@ -1,5 +1,6 @@
 """Publish runs: fit the probes on a finished run's data, and write one artifact folder."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from mvitac.deploy.artifact import preprocessing, read
 from mvitac.deploy.card import card
 from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import as_trained, check_unseen, stored_result
-from mvitac.evaluation.leaks import Scored, Source, mark_split_leaks, write_sources
+from mvitac.evaluation.leaks import FILE, Scored, Source, mark_split_leaks
 from mvitac.evaluation.probe import FittedProbes, probe_model, scorable, split_rows
 from mvitac.evaluation.regressors import Linear
 from mvitac.evaluation.scores import summarise
@@ -173,7 +174,7 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
             write_atomic(partial / "probes.safetensors", lambda file: file.write(data))
         write_json(partial / "run.json", record, sealed=True)
         if learned is not None:
-            write_sources(partial, learned)
+            shutil.copy(run / FILE, partial)
         keys, infos = ("name", "licence", "source"), [r.info for r in model.probes.values()]
         about = {
             "preprocessing": preprocessing(model),

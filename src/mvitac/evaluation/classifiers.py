@@ -80,6 +80,12 @@ class Constant:
         return np.zeros((self.num_classes, self.width)), bias
 
 
+def spread(x: np.ndarray) -> np.ndarray:
+    """Standard deviation [D] of features [N, D] of any scale; 1 for those that vary by no more than rounding."""
+    std = x.std(0, dtype=np.float64).astype(x.dtype)  # in float32 small squares are lost
+    return np.where(std > 1e-6 * abs(x).max(0), std, std.dtype.type(1))
+
+
 def fit_linear(
     x: np.ndarray, y: np.ndarray, x_val: np.ndarray, y_val: np.ndarray, num_classes: int = 0
 ) -> tuple[Logistic, float]:
@@ -88,7 +94,7 @@ def fit_linear(
     C is chosen on the validation rows. The final fit uses the training and validation rows together. ``num_classes`` is
     K; 0 = up to the highest label.
     """
-    mean, std = x.mean(0), x.std(0) + 1e-6
+    mean, std = x.mean(0), spread(x)
     x, x_val = (x - mean) / std, (x_val - mean) / std
     # C ascends and each fit starts from the last one: about a third of the steps of cold starts.
     model = LogisticRegression(max_iter=300, tol=1e-3, warm_start=True)

@@ -63,7 +63,8 @@ def _standardised(train: Tensor, new: Tensor) -> tuple[Tensor, Tensor]:
 
     A dimension that is not finite counts as constant.
     """
-    mean, std = train.mean(0), train.std(0) + 1e-6
+    mean, std = train.mean(0), train.std(0)
+    std = std.where(std > 1e-6 * train.abs().amax(0), 1.0)  # as ``classifiers.spread``
     least, most = train.amin(0), train.amax(0)
     clipped = new.clamp(least - BEYOND * (most - least), most + BEYOND * (most - least))
     x, z = (((part - mean) / std).nan_to_num(0.0, 0.0, 0.0) for part in (train, clipped))

@@ -92,7 +92,7 @@ def probe_runs(
     # The initial weights that an artifact names may be any file or download.
     runs = [m.run.fresh() if m.foreign else m.run for m in models]
     _check_before(runs, pack, tasks, modalities, session)
-    sources = check_unseen(paths, pack, tasks, allow_leak=allow_leak or bool(session.folds))
+    sources = check_unseen(paths, pack, tasks, weights, allow_leak=allow_leak or bool(session.folds))
     score = partial(_score, [*zip(paths, models, names, sources, strict=True)], runs, modalities, session)
     if session.folds:
         records, retrieval = _in_folds(score, pack, others, tasks, session.folds, sources), []
@@ -255,7 +255,7 @@ def _digests(paths: Sequence[Path], weights: Which = "last") -> list[str]:
 
 
 def check_unseen(
-    paths: Sequence[Path], pack: Pack, tasks: Sequence[AnyTask], *, allow_leak: bool
+    paths: Sequence[Path], pack: Pack, tasks: Sequence[AnyTask], weights: Which = "last", *, allow_leak: bool
 ) -> list[list[Source] | None]:
     """What each run at ``paths`` learned from; None where that is not known.
 
@@ -266,8 +266,9 @@ def check_unseen(
     scored, sources = Scored(pack), []
     for path in paths:
         digest = (load_run(path)[1] if (path / "run.json").exists() else {}).get("pack")
-        sources.append(learned := read_sources(path))
-        refused = [] if allow_leak else (learned or [])[digest == pack.digest :]
+        sources.append(learned := read_sources(path, weights))
+        own = 1 + (weights == "best") if digest == pack.digest else 0
+        refused = [] if allow_leak else (learned or [])[own:]
         for task in tasks if refused else ():
             if (leak := scored.leak(refused, split_rows(pack, task).test)) not in ("", UNKNOWN):
                 seen = f"{path} has seen what {pack.path} would score, task {task.name!r}: {leak}"

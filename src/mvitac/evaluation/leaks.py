@@ -4,8 +4,9 @@
                                     of the rows trained on, and <i>.images, their images' checksums; its name in the
                                     header. sha256: digest of all
 
-The first source of a run is its own training rows. A run that starts from another model's weights adds the sources of that
-model. A source without rows stands for weights of which only their owner, or nothing, says what they were trained on.
+The first source of a run is its own training rows, the next one those of split val that choose its best weights, if it keeps
+them. A run that starts from another model's weights adds the sources of that model. A source without rows stands for weights
+of which only their owner, or nothing, says what they were trained on. run.json has the digest too: the list is of this run.
 """
 
 from collections.abc import Sequence
@@ -22,13 +23,14 @@ from mvitac.data.row_hashes import image_sums, known_images, row_hashes
 from mvitac.data.spec import MODALITIES
 from mvitac.nn.encoders import IMAGENET, SCRATCH
 from mvitac.nn.weights import said_trained_on
-from mvitac.run import Run
+from mvitac.run import Run, load_run
 from mvitac.system.files import SEAL, brief, digest, write_atomic
 
-FILE = "trained_on.safetensors"
+FILE, LEARNED = "trained_on.safetensors", "trained_on"  # and the name of its digest in run.json
 KEYS = ("ids", "groups", "images")
 NOT_SEEN = "copies as JPEG, resized or mirrored are not seen; `mvitac data check PACK OTHER` finds resized ones"
 DECLARED = "its owner says: "  # begins the name of a source without rows whose data its owner names
+CHOSE = ", whose scores chose the best weights"  # ends the name of a source that only these weights have
 UNKNOWN = "unknown"  # a leak that cannot be checked, because nothing says what the run was trained on
 
 
@@ -42,10 +44,10 @@ class Source:
     images: np.ndarray  # uint64, sorted: ``image_sums`` of the rows
 
 
-def source_of(pack: Pack, rows: np.ndarray) -> Source:
-    """The source that pack ``rows`` are."""
+def source_of(pack: Pack, rows: np.ndarray, what: str = "") -> Source:
+    """The source that pack ``rows`` are; ``what`` ends its name."""
     ids, groups, images = (np.unique(found[rows]) for found in (*row_hashes(pack), image_sums(pack)))
-    return Source(pack.spec.name, ids, groups, images[images > 0])
+    return Source(pack.spec.name + what, ids, groups, images[images > 0])
 
 
 def unknown_source(name: str) -> Source:
@@ -81,30 +83,32 @@ def with_ancestors(own: Source, ancestors: Sequence[Source]) -> list[Source]:
 def write_sources(folder: Path, sources: Sequence[Source]) -> None:
     """Write what the run in ``folder`` learns from."""
     arrays = {f"{i}.{key}": getattr(source, key) for i, source in enumerate(sources) for key in KEYS}
-    arrays[SEAL] = _digest(sources)
+    arrays[SEAL] = np.frombuffer(bytes.fromhex(sources_digest(sources)), np.uint8)
     data = safetensors.numpy.save(arrays, metadata={str(i): source.name for i, source in enumerate(sources)})
     write_atomic(folder / FILE, lambda file: file.write(data))
 
 
-def _digest(sources: Sequence[Source]) -> np.ndarray:
-    """uint8 [32]"""
-    content = [[source.name, *(getattr(source, key).tolist() for key in KEYS)] for source in sources]
-    return np.frombuffer(bytes.fromhex(digest(content)), np.uint8)
+def sources_digest(sources: Sequence[Source]) -> str:
+    """Content address of the list."""
+    return digest([[source.name, *(getattr(source, key).tolist() for key in KEYS)] for source in sources])
 
 
-def read_sources(folder: Path) -> list[Source] | None:
-    """What the run in ``folder`` learned from; None if that is not known."""
+def read_sources(folder: Path, weights: str = "last") -> list[Source] | None:
+    """What the ``weights`` of the run in ``folder``, last or best, learned from; None if that is not known."""
     if not (folder / FILE).exists():
         return None
     try:
         with safetensors.safe_open(folder / FILE, framework="numpy") as file:
             names = file.metadata()
             found = [Source(names[i], *(file.get_tensor(f"{i}.{key}") for key in KEYS)) for i in sorted(names, key=int)]
-            if not np.array_equal(file.get_tensor(SEAL), _digest(found)):
+            if not file.get_tensor(SEAL).tobytes().hex() == sources_digest(found):
                 raise ValueError("it does not match its digest")
-        return found
     except Exception as error:  # safetensors raises several types for damaged files
         raise ValueError(f"{folder / FILE} is damaged ({brief(error)}): copy it again, or re-train") from None
+    record = load_run(folder)[1] if (folder / "run.json").exists() else {}
+    if record.get(LEARNED, own := sources_digest(found)) != own:
+        raise ValueError(f"{folder / FILE} is of another run: copy the one of this run")
+    return [source for source in found if weights == "best" or not source.name.endswith(CHOSE)]
 
 
 class Scored:

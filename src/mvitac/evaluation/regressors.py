@@ -15,7 +15,7 @@ from sklearn.neighbors import KNeighborsRegressor
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import SplineTransformer
 
-from mvitac.evaluation.classifiers import NEIGHBOURS, one_blas_thread
+from mvitac.evaluation.classifiers import NEIGHBOURS, one_blas_thread, spread
 from mvitac.evaluation.diagnostics import BEYOND
 
 Regressor = Callable[[np.ndarray], np.ndarray]
@@ -30,7 +30,7 @@ class Scaler(TransformerMixin, BaseEstimator):
     def fit(self, x: np.ndarray, y: None = None) -> "Scaler":
         least, most = x.min(0), x.max(0)
         self.low_, self.high_ = least - BEYOND * (most - least), most + BEYOND * (most - least)
-        self.mean_, self.scale_ = x.mean(0), np.where(most > least, x.std(0), 1.0)
+        self.mean_, self.scale_ = x.mean(0), spread(x)
         return self
 
     def transform(self, x: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack
 from mvitac.data.spec import listed
+from mvitac.evaluation.classifiers import spread
 from mvitac.evaluation.features import features, sample
 from mvitac.evaluation.probe_config import Standardise
 from mvitac.model import Model
@@ -100,7 +101,7 @@ def touch_features(
         z = mean(own, looks)
         if "features" in standardise:
             seen = mean(known, looks)
-            z = (z - seen.mean(0)) / (seen.std(0) + 1e-6)
+            z = (z - seen.mean(0)) / spread(seen)
         parts.append(z)
     order = np.argsort(sensors, kind="stable")  # of the rows in ``parts``
     return np.concatenate(parts)[np.argsort(order)]

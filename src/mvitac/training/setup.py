@@ -16,7 +16,17 @@ from mvitac.data.spec import DataSpec
 from mvitac.data.windows import places
 from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.features import features
-from mvitac.evaluation.leaks import FILE, file_source, source_of, weights_files, with_ancestors, write_sources
+from mvitac.evaluation.leaks import (
+    CHOSE,
+    FILE,
+    LEARNED,
+    file_source,
+    source_of,
+    sources_digest,
+    weights_files,
+    with_ancestors,
+    write_sources,
+)
 from mvitac.evaluation.sensors import sensors_of
 from mvitac.methods.base import Method
 from mvitac.model import Model, load
@@ -99,9 +109,13 @@ def _rows(run: Run, pack: Pack, world: World) -> np.ndarray:
 
 def _record(setup: Setup, asked: Run, out: Path, start: Start | None, taken: dict[str, Any], *, quiet: bool) -> None:
     """Write run.json and the hashes of the rows that the run learns from, and say what it starts from."""
-    run, pack = setup.run, setup.pack
+    run, pack, val = setup.run, setup.pack, setup.pack.rows("val")
+    before = [*(start.sources if start else []), *map(file_source, weights_files(run))]
+    chose = [source_of(pack, val, CHOSE)] if len(val) else []
+    sources = with_ancestors(source_of(pack, setup.rows), [*chose, *before])
     if not (out / "run.json").exists():
         record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(setup.spec)}
+        record |= {LEARNED: sources_digest(sources)}
         record |= {"device": describe(setup.hardware.device), "precision": run.precision}
         record["bf16_slowdown"], said = setup.hardware.slowdown, []
         used = [m for m in setup.method.encoders() if run.encoder[m].weights == IMAGENET]
@@ -116,8 +130,7 @@ def _record(setup: Setup, asked: Run, out: Path, start: Start | None, taken: dic
             print(f"mvitac: {line}", file=sys.stderr)
         write_json(out / "run.json", {**record, **provenance()}, sealed=True)
     if not (out / FILE).exists():
-        before = [*(start.sources if start else []), *map(file_source, weights_files(run))]
-        write_sources(out, with_ancestors(source_of(pack, setup.rows), before))
+        write_sources(out, sources)
 
 
 def check_out(out: Path, resume: bool) -> None:

@@ -10,7 +10,7 @@ from torch import nn
 from mvitac.data.pack import Pack
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, file_source, read_sources, unknown_source, weights_files
 from mvitac.methods.base import Method
-from mvitac.model import load
+from mvitac.model import BEST, load
 from mvitac.nn.encoders import within
 from mvitac.nn.initial import Init
 from mvitac.nn.momentum import Momentum
@@ -39,7 +39,7 @@ def read_start(init: Init) -> Start | None:
     heads = {m: head.state_dict() for m, head in model.projectors.items()}
     # Only the folder of a run or an artifact knows what its model learned from: a copied file is unknown.
     own = init.file.name.startswith("model.") and (folder / "run.json").exists()
-    found = read_sources(folder) if own else None
+    found = read_sources(folder, "best" if init.file.name == BEST else "last") if own else None
     learned = [unknown_source(folder.name if own else init.file.name)] if found is None else found
     return Start(init, trunks, heads, model.run.encoder.named(model.encoders), learned, model.spec.sensors)
 
