@@ -267,6 +267,9 @@ class Model(nn.Module):
             ValueError: As for ``embed``, or if the model has no probe on these modalities.
         """
         given = self.embed(vision=vision, touch=touch, background=background)
+        if len({len(features) for features in given.values()}) > 1:
+            numbers = " and ".join(f"{len(features)} of {modality}" for modality, features in given.items())
+            raise ValueError(f"{numbers} are no pairs: give as many images of each, or one modality")
         asked = "both" if len(given) == 2 else next(iter(given))
         chosen = [r for r in self.probes.values() if r.info.modality == asked]
         if not chosen:

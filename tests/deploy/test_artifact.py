@@ -34,6 +34,8 @@ def test_predicts_what_the_probe_scored(smoke_run: Path, artifact: Path, pack: P
     images = pack.images["touch"][:5]
     assert torch.equal(model.embed(touch=images)["touch"], mvitac.load(smoke_run).embed(touch=images)["touch"])
     assert not any(module.training for module in model.modules())
+    with pytest.raises(ValueError, match="4 of vision and 5 of touch are no pairs"):
+        model.predict(vision=pack.images["vision"][:4], touch=images)
 
 
 def test_the_card_names_what_encoders_and_what_probes_learned_from(artifact: Path) -> None:

@@ -24,8 +24,8 @@ from mvitac.evaluation import controls
 from mvitac.evaluation import features as features_module
 from mvitac.evaluation.classifiers import fit_knn, fit_linear, fit_papers
 from mvitac.evaluation.controls import borders, controls_of, frozen_trunks, imagenet_trunk, starts_of, thumbnails
-from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.diagnostics import linear_probe
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.few_labels import few
 from mvitac.evaluation.folds import fold_splits
 from mvitac.evaluation.leaks import read_sources

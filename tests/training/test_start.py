@@ -21,7 +21,7 @@ from mvitac.model import fresh, load
 from mvitac.nn.encoders import Encoders, PerFrame, build_trunk
 from mvitac.nn.initial import Init
 from mvitac.nn.momentum import Momentum
-from mvitac.nn.weights import adapt_stem
+from mvitac.nn.weights import _say, adapt_stem
 from mvitac.run import Run, load_run
 from mvitac.training.loop import train
 from mvitac.training.start import describe, load_start, load_trunk, read_start
@@ -87,11 +87,14 @@ def test_a_model_of_one_modality(pack: Pack, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("channels", "wanted"), [(3, 6), (6, 3), (6, 9), (3, 3)])
-def test_stem_is_adapted_to_the_channels(channels: int, wanted: int) -> None:
-    """The same picture in all places gives the same features, whatever their number."""
+def test_stem_is_adapted_to_the_channels(channels: int, wanted: int, capsys: pytest.CaptureFixture[str]) -> None:
+    """The same picture in all places gives the same features, whatever their number; fewer or other ones are said."""
+    _say.cache_clear()
     torch.manual_seed(0)
     before, after = build_trunk(TINY.touch, channels).eval(), build_trunk(TINY.touch, wanted).eval()
     load_trunk(after, before.state_dict())
+    said = f"a first convolution of {channels} channels is made one of {wanted}"
+    assert (said in capsys.readouterr().err) == (channels > 3)
     picture = torch.randn(2, 3, 32, 32)
     expected = before(picture.repeat(1, channels // 3, 1, 1))
     assert torch.allclose(after(picture.repeat(1, wanted // 3, 1, 1)), expected, atol=1e-5)

@@ -197,6 +197,8 @@ def adapt_stem(weight: Float[Tensor, "O C h w"], channels: int) -> Float[Tensor,
     """
     if weight.shape[1] == channels:
         return weight
+    if weight.shape[1] > 3:
+        _say(f"a first convolution of {weight.shape[1]} channels is made one of {channels}")
     return adapt_input_conv(channels, weight.unflatten(1, (-1, 3)).sum(1))
 
 

@@ -110,7 +110,9 @@ def read_json(path: Path, what: str) -> Any:
     except FileNotFoundError:
         raise ValueError(f"{path} does not exist: {what} is missing there") from None
     except (OSError, ValueError) as error:  # also: a folder, invalid UTF-8, numbers of 5000 digits
-        raise ValueError(f"{path} is not valid JSON ({brief(error)}): {what} is damaged") from None
+        raise ValueError(
+            f"{path} is not valid JSON ({brief(error)}): {what} is damaged, or this is another file"
+        ) from None
     if isinstance(value, dict) and SEAL in value and value.pop(SEAL) != digest(value):
         how = f"{what} was damaged or edited (or delete the entry {SEAL!r})"
         raise ValueError(f"{path} does not match its digest: {how}")
