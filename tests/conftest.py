@@ -91,11 +91,10 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="session")
 def smoke_run(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of eight steps on the striped pairs."""
-    from mvitac.datasets.pack import PackConfig
-    from mvitac.recipes import recipe
     from mvitac.training.loop import train
+    from support.training_runs import smoke
 
-    return train(recipe("smoke", PackConfig(path=pack.path)), tmp_path_factory.mktemp("smoke") / "run", quiet=True)
+    return train(smoke(pack), tmp_path_factory.mktemp("smoke") / "run", quiet=True)
 
 
 @pytest.fixture(scope="session")
@@ -144,15 +143,12 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Pack:
 @pytest.fixture(scope="session")
 def value_artifact(measured: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two steps on ``measured``, published."""
-    from dataclasses import replace
-
-    from mvitac.datasets.pack import PackConfig
     from mvitac.deploy.publish import publish
-    from mvitac.recipes import recipe
     from mvitac.training.loop import train
+    from support.training_runs import smoke
 
     def make(folder: Path) -> None:
-        run = replace(recipe("smoke", PackConfig(path=measured.path)), steps=2, eval_every=0)
+        run = smoke(measured, steps=2, eval_every=0)
         publish(train(run, folder / "run", quiet=True), folder / "artifact")
 
     return made_once(tmp_path_factory, "values", make) / "artifact"

@@ -15,13 +15,12 @@ from torch.utils.data import DataLoader
 import mvitac
 from mvitac.data.images import difference, fit
 from mvitac.data.pack import Pack
-from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.features import pack_features
 from mvitac.methods.calandra import CalandraConfig
 from mvitac.model import Model, fresh
-from mvitac.recipes import recipe
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD, plain_view
 from support.toy import toy_pack
+from support.training_runs import smoke
 
 
 def batch(pack: Pack, num: int, modality: str = "touch") -> torch.Tensor:
@@ -52,9 +51,8 @@ def test_embed_equals_the_probes_features(model: Model, pack: Pack) -> None:
 
 def test_whole_images_are_seen_at_their_own_size(model: Model, pack: Pack) -> None:
     crops = replace(model.run.augment, size=16, whole=24)
-    smaller = Model(
-        model.run.method.build(pack.spec, model.run.encoder), replace(model.run, augment=crops), pack.spec, 32
-    )
+    method, run = model.run.method.build(pack.spec, model.run.encoder), replace(model.run, augment=crops)
+    smaller = Model(method, run, pack.spec, 32)
     images = torch.from_numpy(pack.images["touch"][[0, 1, 2, 3]]).permute(0, 3, 1, 2)
     expected = smaller.encoders["touch"](plain_view(images, 24)).detach()
     assert torch.equal(smaller.features("touch", images), expected)
@@ -171,7 +169,7 @@ def test_transform_prepares_images_in_a_data_loader(model: Model) -> None:
 def test_trunk_is_a_plain_timm_model(pack: Pack, tmp_path: Path) -> None:
     import timm
 
-    run = recipe("smoke", PackConfig(path=pack.path))
+    run = smoke(pack)
     run = replace(run, encoder=run.encoder.changed(trunk="resnet10t"), augment=replace(run.augment, whole=24))
     model = fresh(run, pack.spec, 32)
     before = [type(layer) for layer in model.modules()]
@@ -179,9 +177,8 @@ def test_trunk_is_a_plain_timm_model(pack: Pack, tmp_path: Path) -> None:
     config = timm.data.resolve_model_data_config(trunk)
     assert (config["input_size"], config["mean"], config["std"]) == ((3, 24, 24), IMAGENET_MEAN, IMAGENET_STD)
     assert trunk.num_features == 512 and trunk.pretrained_cfg["num_classes"] == 0
-    assert {type(layer) for layer in trunk.modules()} == {type(m) for m in timm.create_model("resnet10t").modules()} - {
-        torch.nn.Linear
-    } | {torch.nn.Identity}
+    kinds, theirs = ({type(m) for m in net.modules()} for net in (trunk, timm.create_model("resnet10t")))
+    assert kinds == theirs - {torch.nn.Linear} | {torch.nn.Identity}
     timm.models.save_for_hf(trunk, str(tmp_path), safe_serialization=True)
     again = timm.create_model(f"local-dir:{tmp_path}", pretrained=True).eval()
     images = pack.images["touch"][:2]
@@ -195,7 +192,7 @@ def test_trunk_is_a_plain_timm_model(pack: Pack, tmp_path: Path) -> None:
 
 def test_trunk_of_two_sensors_has_six_channels(tmp_path: Path) -> None:
     pack = toy_pack(tmp_path / "p", touch_channels=6, num=12)
-    model = fresh(recipe("smoke", PackConfig(path=pack.path)), pack.spec, 32)
+    model = fresh(smoke(pack), pack.spec, 32)
     cfg = model.trunk("touch").pretrained_cfg
     assert cfg["input_size"] == (6, 32, 32) and cfg["mean"] == IMAGENET_MEAN * 2 and len(cfg["std"]) == 6
     streams = replace(model.run, method=CalandraConfig())
@@ -220,9 +217,8 @@ def test_embed_resizes_as_the_pack_does(model: Model) -> None:
 
 def test_background_is_subtracted_at_the_stored_size_as_in_packs(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(3)
-    free, press = (
-        np.stack([fit(x, 32) for x in rng.integers(0, 255, (2, 80, 100, 3), dtype=np.uint8)]) for _ in range(2)
-    )
+    large = rng.integers(0, 255, (2, 2, 80, 100, 3), dtype=np.uint8)
+    free, press = (np.stack([fit(image, 32) for image in images]) for images in large)
     with pytest.raises(ValueError, match="background cannot be used"):
         model.embed(touch=press, background=free)
     monkeypatch.setattr(model, "spec", replace(model.spec, difference=True))

@@ -84,6 +84,5 @@ def test_later_pages_run(artifact: Path, pack: Pack, tmp_path: Path, monkeypatch
     for source in code:
         exec(compile(source, "page", "exec"), names)
     assert names["features"]["touch"].shape == (72, 64) and names["scores"].mean() > 0.75  # chance is .5
-    assert np.allclose(
-        names["theirs"](Image.open(names["touches"][0])), names["prepare"](names["touches"][0]), atol=1e-5
-    )
+    first = names["touches"][0]
+    assert np.allclose(names["theirs"](Image.open(first)), names["prepare"](first), atol=1e-5)

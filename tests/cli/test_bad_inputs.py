@@ -335,8 +335,6 @@ def test_files(
     assert not (tmp_path / "exploded").exists()
 
 
-# -- places -----------------------------------------------------------------------------------------------------------
-
 PLACES = {
     "{tmp}/file/below": "Not a directory",
     "{tmp}/" + "n" * 300: "too long",

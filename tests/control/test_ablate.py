@@ -32,9 +32,8 @@ class Presses(Source):
 
     def spec(self) -> DataSpec:
         names = {"action": ["force", "turn"], "state": ["clock"]}
-        values = tuple(
-            ValueTask(name=n, targets=tuple(Target(name=c, unit="1") for c in cs)) for n, cs in names.items()
-        )
+        targets = {task: tuple(Target(name=column, unit="1") for column in names[task]) for task in names}
+        values = tuple(ValueTask(name=task, targets=each) for task, each in targets.items())
         about: Any = {"vision_channels": 3, "touch_channels": 3, "tasks": (), "group_by": "episode"}
         return DataSpec(name="presses", values=values, licence="none", source="this test", **about)
 
@@ -101,8 +100,7 @@ class Fickle:
 )
 def test_verdicts(pack: Pack, policy: Any, touch: str, vision: str) -> None:
     result = ablate(policy, read_episodes(pack))
-    assert result["verdicts"]["touch"].startswith(touch)
-    assert result["verdicts"]["vision"].startswith(vision)
+    assert result["verdicts"]["touch"].startswith(touch) and result["verdicts"]["vision"].startswith(vision)
     if isinstance(policy, Fickle):
         assert policy.episodes == 8 * 10  # as it is twice
 

@@ -79,9 +79,7 @@ def test_demonstrations_are_other_grasps_and_go_astray(small: Insert) -> None:
     for number in range(5):
         assert np.abs(wanted[:, 0] - Insertion(WHOLE, number).known).max(1).min() > 0.01
     world = Insertion(WHOLE, 0, trained=True)
-    assert np.array_equal(images["vision"][0], world.look("vision")) and np.array_equal(
-        images["touch"][0], world.look("touch")
-    )
+    assert all(np.array_equal(images[sense][0], world.look(sense)) for sense in ("vision", "touch"))
     for _ in range(4):
         world.step(world.known)
     assert np.abs(images["vision"][4].astype(int) - world.look("vision")).mean() > 1

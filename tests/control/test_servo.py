@@ -115,8 +115,7 @@ def test_pictures_show_the_pose_and_repeat() -> None:
 def test_presses_cover_what_probes_need() -> None:
     for name, task in TASKS.items():
         poses = np.concatenate([presses(name, 0, 8, number)[1] for number in range(3)])
-        assert (np.abs(poses - task.target) < 1.25 * task.reach).all()
-        assert (poses.std(0) > task.reach / 4).all()
+        assert (np.abs(poses - task.target) < 1.25 * task.reach).all() and (poses.std(0) > task.reach / 4).all()
 
 
 def test_a_result_repeats_and_says_how_good_each_row_is(

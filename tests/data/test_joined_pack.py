@@ -13,10 +13,9 @@ from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack
 from mvitac.data.source import Sample
 from mvitac.data.spec import DataSpec, Task
-from mvitac.datasets.pack import PackConfig
-from mvitac.recipes import recipe
 from mvitac.training.loop import train
 from support.toy import Toy, toy_pack
+from support.training_runs import smoke
 
 
 class Negative(Toy):
@@ -53,8 +52,7 @@ def test_train_is_of_the_one_and_test_of_the_other(pack: Pack, negative: Pack) -
     assert [task.name for task in both.spec.tasks] == ["pattern"]
     assert both.spec.tasks[0].classes == pack.spec.tasks[0].classes
     np.testing.assert_array_equal(both.labels("pattern"), np.tile(pack.labels("pattern"), 2), "classes go by name")
-    assert both.has("touch").all()
-    assert not both.spec.controls
+    assert both.has("touch").all() and not both.spec.controls
     assert both.spec.name == f"{negative.path.name}, probes learned on {pack.path.name}"
     assert both.digest not in (pack.digest, negative.digest)
     assert JoinedPack(negative, pack).digest != both.digest
@@ -151,7 +149,7 @@ def test_an_image_that_is_learned_from_and_scored_is_refused(pack: Pack, tmp_pat
 def test_probe_learns_on_one_pack_and_meets_another(
     pack: Pack, negative: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = replace(recipe("smoke", PackConfig(path=pack.path)), steps=1, eval_every=0)
+    run = smoke(pack, steps=1, eval_every=0)
     train(run, tmp_path / "run", quiet=True)
     asked = ["probe", str(tmp_path / "run"), "--tasks", "pattern", "--modalities", "touch", "--json"]
     assert not main([*asked, str(tmp_path / "new.json"), "--on", str(negative.path), "--learn-on", str(pack.path)])

@@ -42,9 +42,6 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Pack:
     return jpeg_pack(tmp_path_factory.mktemp("jpeg") / "pack")
 
 
-# -- what is stored ---------------------------------------------------------------------------------------------------
-
-
 def test_rows_are_what_pillow_decodes(pack: Pack, small: Pack, tmp_path: Path) -> None:
     assert (small.meta["store"], small.meta["quality"], pack.meta["store"]) == ("jpeg", 95, "raw")
     assert {p.name for p in small.path.iterdir()} == {*FILES, "provenance.json"}
@@ -79,8 +76,7 @@ def test_indexed_like_the_array_it_stands_for(
         monkeypatch.setattr(jpeg, "_num_threads", lambda: num_threads)
         monkeypatch.setattr(jpeg, "_threads", lambda: pool)
         found = images[index]
-    assert found.dtype == np.uint8 and np.array_equal(found, whole[index])
-    assert found.shape == whole[index].shape
+    assert found.dtype == np.uint8 and np.array_equal(found, whole[index]) and found.shape == whole[index].shape
     assert (len(images), images.shape, images.dtype, images.nbytes) == (120, whole.shape, whole.dtype, whole.nbytes)
 
 
@@ -102,9 +98,6 @@ def test_a_missing_image_has_no_bytes(tmp_path: Path) -> None:
     assert ((found.images["touch"][:] == 0).all((1, 2, 3)) == ~found.has("touch")).all()
 
 
-# -- packing ----------------------------------------------------------------------------------------------------------
-
-
 def test_the_command_line_and_the_cache(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["data", "pack", "--data", "materials", "--num", "20", "--size", "16", "--workers", "1", "--quiet"]
     assert main([*words, "--store", "jpeg", "--out", str(tmp_path / "p")]) == 0
@@ -115,9 +108,6 @@ def test_the_command_line_and_the_cache(tmp_path: Path, capsys: pytest.CaptureFi
     kept = [replace(config, **changes).open(quiet=True) for changes in ({}, {"store": "raw"}, {"quality": 81})]  # type: ignore[arg-type]
     assert kept[0].digest == Pack(tmp_path / "p").digest and len({pack.path for pack in kept}) == 3
     assert isinstance(kept[0].images["touch"], Jpegs) and isinstance(kept[1].images["touch"], np.ndarray)
-
-
-# -- damage -----------------------------------------------------------------------------------------------------------
 
 
 def lengths(change: Callable[[np.ndarray], pa.Array | None]) -> Callable[[Path], None]:
@@ -189,9 +179,6 @@ def test_a_row_that_cannot_be_decoded_is_named(small: Pack, tmp_path: Path, kind
     assert found.images["touch"][6].any()
     with pytest.raises(ValueError, match="Premature end of JPEG file"):
         decode(one[: len(one) // 2], (32, 32, 3))
-
-
-# -- what reads packs -------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

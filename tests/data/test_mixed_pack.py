@@ -18,7 +18,7 @@ from mvitac.data.windows import windowed
 from mvitac.datasets.mix import MixConfig
 from mvitac.evaluation.leaks import Scored, source_of
 from support.mixes import Gel, Slice, built
-from support.toy import Toy
+from support.toy import Toy, Turned
 
 
 @pytest.fixture(scope="module")
@@ -152,20 +152,14 @@ def test_one_part_alone(pack: Pack, gel: Pack) -> None:
     assert len(mix.rows("train")) > len(gel.rows("train"))
 
 
-class Turned(Slice):
+class TurnedSlice(Turned, Slice):
     """Train is test here."""
-
-    def read(self, item: int) -> list[Sample]:
-        (sample,) = super().read(item)
-        split = {"train": "test", "test": "train", "val": "val"}[sample.columns["split"]]
-        return [replace(sample, columns={**sample.columns, "split": split})]
 
 
 def test_a_group_on_two_sides_is_refused_or_marked(pack: Pack, tmp_path: Path) -> None:
-    turned = built(Turned(num=60), tmp_path / "p")
-    with pytest.raises(
-        ValueError, match=r"instance '0-6' is in train or val of part b and in test of part a, one of \d+"
-    ):
+    turned = built(TurnedSlice(num=60), tmp_path / "p")
+    says = r"instance '0-6' is in train or val of part b and in test of part a, one of \d+"
+    with pytest.raises(ValueError, match=says):
         MixedPack({"b": turned, "a": pack})
     mix = MixedPack({"a": pack, "b": turned}, allow_leak=True)
     assert mix.spec.notes[0].startswith("instance")
@@ -181,13 +175,11 @@ def test_a_leak_between_a_mix_and_a_pack_is_found(pack: Pack, gel: Pack) -> None
 
 
 def test_an_image_on_two_sides_under_two_names_is_refused(pack: Pack, tmp_path: Path) -> None:
-    turned = built(Turned(num=60, prefix="copy "), tmp_path / "p")
-    expected = (
-        r"the vision image of row 'copy 0\d+' is in train or val of part a and in test of part b, one of \d+: pack"
-    )
-    with pytest.raises(ValueError, match=expected):
+    turned = built(TurnedSlice(num=60, prefix="copy "), tmp_path / "p")
+    says = r"the vision image of row 'copy 0\d+' is in train or val of part a and in test of part b, one of \d+: pack"
+    with pytest.raises(ValueError, match=says):
         MixedPack({"a": pack, "b": turned})
-    small = built(Turned(num=60, prefix="copy "), tmp_path / "small", size=16)
+    small = built(TurnedSlice(num=60, prefix="copy "), tmp_path / "small", size=16)
     MixedPack({"a": pack, "b": small})  # images of other sizes cannot be compared
 
 

@@ -249,8 +249,7 @@ def test_damaged_items_stop_or_are_listed(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"2 of 120 items cannot be read, first item 3: item 3 is damaged"):
         build(source, tmp_path / "strict", size=32, quiet=True)
     lenient = build(source, tmp_path / "lenient", size=32, max_damaged=0.05, quiet=True)
-    assert lenient.num == 118
-    assert [name for name, _ in lenient.meta["damaged"]] == ["item 3", "item 40"]
+    assert lenient.num == 118 and [name for name, _ in lenient.meta["damaged"]] == ["item 3", "item 40"]
     assert "0003" not in lenient.column("id")
     check_images(lenient, [item for item in range(120) if item not in (3, 40)])
 
@@ -294,10 +293,8 @@ def test_a_script_without_a_main_guard_is_told(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     call = f"build(Toy(extra={{'long': 'x' * 200_000}}), {str(tmp_path / 'p')!r}, size=32, workers=2)"
     script.write_text(f"from mvitac.data.build import build\nfrom support.toy import Toy\n{call}\n")
-    path = os.pathsep.join(sys.path)
-    done = subprocess.run(
-        [sys.executable, script], env=os.environ | {"PYTHONPATH": path}, capture_output=True, timeout=60
-    )
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, script], env=env, capture_output=True, timeout=60)
     assert b"ValueError: a packing process died: out of memory, or a script without `if __name__" in done.stderr
     assert done.stderr.count(b"Traceback") == 1
 
@@ -330,8 +327,7 @@ def test_scoring_on_val_hides_test(pack: Pack) -> None:
     assert len(whole.rows("val")) and len(whole.rows("test"))
     np.testing.assert_array_equal(choosing.rows("test"), whole.rows("val"))
     np.testing.assert_array_equal(choosing.rows("train", "unlabelled"), whole.rows("train", "unlabelled"))
-    assert not len(choosing.rows("val"))
-    assert choosing.spec.notes == (*whole.spec.notes, ON_VAL)
+    assert not len(choosing.rows("val")) and choosing.spec.notes == (*whole.spec.notes, ON_VAL)
     task = whole.spec.tasks[0].name
     unseen = whole.rows("test")
     assert (choosing.labels(task, "train", "val", "test")[unseen] == -1).all()

@@ -71,8 +71,7 @@ def test_any_choice_of_frames_is_the_one_it_says(path: Path, seed: int) -> None:
     found = list(frames(path, wanted, 48))
     assert [number for number, _ in found] == sorted(wanted)
     for number, image in found:
-        assert image.shape == (48, 48, 3) and image.dtype == np.uint8
-        assert read_number(image)[0] == number
+        assert image.shape == (48, 48, 3) and image.dtype == np.uint8 and read_number(image)[0] == number
 
 
 def test_the_pixels_are_those_of_decoding_from_the_start(path: Path) -> None:
@@ -167,8 +166,7 @@ def test_a_damaged_packet_costs_frames_up_to_the_next_key_frame(path: Path, tmp_
     hurt = copy_with(path, tmp_path / path.name, at, data)
     lost: dict[int, str] = {}
     found = dict(frames(hurt, range(NUM), lost=lost))
-    assert sorted({*found, *lost}) == list(range(NUM))
-    assert not {*found} & {*lost}
+    assert sorted({*found, *lost}) == list(range(NUM)) and not {*found} & {*lost}
     # One bit may be harmless to the picture; anything that is shown must be right.
     assert all(np.abs(image.astype(int) - good[number]).max() < 40 for number, image in found.items())
     assert all(read_number(image)[0] == number for number, image in found.items())

@@ -23,7 +23,7 @@ from mvitac.recipes import recipe
 from mvitac.training.loop import train
 from mvitac.training.sampler import draw_positives
 from mvitac.transforms.random_views import Augment
-from support.training_runs import assert_equal_weights, power_cut
+from support.training_runs import train_twice
 
 TOUCHES, LENGTH = 8, 6
 
@@ -35,9 +35,8 @@ class Presses(Source):
 
     def spec(self) -> DataSpec:
         task = Task(name="late", classes=("early", "late"))
-        return DataSpec(
-            name="presses", vision_channels=3, touch_channels=3, tasks=(task,), group_by="object", licence="", source=""
-        )
+        known: Any = {"vision_channels": 3, "touch_channels": 3, "group_by": "object", "licence": "", "source": ""}
+        return DataSpec(name="presses", tasks=(task,), **known)
 
     def items(self) -> list[str]:
         return [f"{t}-{f}" for f in self.order for t in range(TOUCHES) if (t, f) != (1, 3)]
@@ -138,9 +137,7 @@ def test_a_window_trains_probes_and_reloads(presses: Pack, tmp_path: Path, tempo
     assert model.spec.frames("touch") == 2 and model.spec.frames("vision") == 1
     result = probe_runs([out], ProbeConfig(controls=False))
     assert {record["modality"] for record in result["records"]} == {"touch", "vision", "both"}
-    on = probe_runs(
-        [out], ProbeConfig(controls=False), Pack(presses.path), allow_leak=True
-    )  # as --on: windows of the run
+    on = probe_runs([out], ProbeConfig(controls=False), Pack(presses.path), allow_leak=True)  # --on: the run's windows
     assert on["pack"] == result["pack"] and on["records"] == result["records"]
     embedded = tmp_path / "touch.parquet"
     assert main(["embed", str(presses.path), "--model", str(out), "--out", str(embedded)]) == 0
@@ -173,11 +170,7 @@ def test_positives_can_be_near_in_time(presses: Pack, tmp_path: Path) -> None:
     run = replace(run, steps=6, batch_size=8, eval_every=0, augment=Augment(size=16), checkpoint_every=2)
     near = replace(run, positives="same-touch", positives_within=1.0)
     assert near.digest() != run.digest()
-    train(near, tmp_path / "straight", quiet=True)
-    with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
-        train(near, tmp_path / "cut", quiet=True)
-    train(near, tmp_path / "cut", resume=True, quiet=True)
-    assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
+    train_twice(near, tmp_path, cut=3)
 
 
 def test_positives_near_in_time_that_cannot_be(presses: Pack, pack: Pack, tmp_path: Path) -> None:

@@ -18,13 +18,12 @@ from mvitac.bench.suite import find_suite, open_set
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.calandra import AUTHORS_TEST, AUTHORS_TRAIN, PHASES, Calandra, CalandraConfig, owners_shuffle
-from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.probe import split_rows
-from mvitac.recipes import recipe
 from mvitac.report.tables import print_summary
 from mvitac.training.loop import train
 from mvitac.training.views import StepViews
+from support.training_runs import smoke
 
 GEL, KINECT = (24, 32, 3), (54, 96, 3)
 OBJECTS = ("lemon", "lime", "potato", "onion", "soft_zebra", "metal_can", "some_other_thing")
@@ -107,9 +106,6 @@ def test_a_pack_depends_on_what_the_shards_hold_and_when_they_were_written(folde
         assert (old != new) == name.startswith("calandra_corl2017_000")
 
 
-# -- names ------------------------------------------------------------------------------------------------------------
-
-
 def test_object_names_are_repaired(tmp_path: Path) -> None:
     write_shard(tmp_path, 0, [b"plastic_duc", b"plastic_duck", b" lemon\0", "lime", b"hair_dryer_"])
     source = Calandra(CalandraConfig(path=tmp_path, split="object"))
@@ -127,9 +123,6 @@ def test_outcome_as_pytables_stores_it(tmp_path: Path) -> None:
         made = h5py.h5a.create(attributes._id, b"is_gripping", h5py.h5t.NATIVE_B8, space)
         made.write(np.array(1, np.uint8), mtype=h5py.h5t.NATIVE_B8)
     assert CalandraConfig(path=tmp_path, split="object").source().read(0)[0].columns["outcome"] == 1
-
-
-# -- damage -----------------------------------------------------------------------------------------------------------
 
 
 def test_damaged_grasps_are_listed_and_the_rest_is_read(tmp_path: Path) -> None:
@@ -173,9 +166,6 @@ def test_missing_data_is_said(tmp_path: Path) -> None:
         CalandraConfig(path=tmp_path).source()
 
 
-# -- splits -----------------------------------------------------------------------------------------------------------
-
-
 def splits_of(config: CalandraConfig) -> dict[str, str]:
     source = config.source()
     return {c["group"]: c["split"] for i in range(len(source.items())) for c in [source.read(i)[0].columns]}
@@ -215,11 +205,7 @@ def test_the_owners_order_is_python_2s_shuffle() -> None:
     for i, value in zip(range(19, 0, -1), floats, strict=True):
         j = int(value * (i + 1))
         expected[i], expected[j] = expected[j], expected[i]
-    assert owners_shuffle(names[::-1], 3) == expected
-    assert sorted(expected) == names != expected
-
-
-# -- 'after' ----------------------------------------------------------------------------------------------------------
+    assert owners_shuffle(names[::-1], 3) == expected and sorted(expected) == names != expected
 
 
 @pytest.fixture(scope="module")
@@ -251,7 +237,7 @@ def test_after_reaches_no_probe_unless_named_and_then_every_table_says_so(leakin
     shown = {}
     for ask in (("during",), ("after",)):
         pack = leaking_pack(leaking, tmp_path / ask[0], ask=ask)
-        run = replace(recipe("smoke", PackConfig(path=pack.path)), steps=2, eval_every=1)
+        run = smoke(pack, steps=2, eval_every=1)
         session = ProbeConfig(probes=("linear", "knn"), modalities=("touch",))
         result = probe_runs([train(run, tmp_path / f"run-{ask[0]}", quiet=True)], session)
         print_summary(result, file := io.StringIO())
@@ -284,7 +270,7 @@ def test_labels_are_only_of_rows_the_task_is_about(tmp_path: Path) -> None:
     about = pack.column("phase") == "during"
     assert (pack.column("label_success") >= 0).all()
     assert np.array_equal(pack.labels("success") >= 0, about)
-    run = recipe("smoke", PackConfig(path=pack.path))
+    run = smoke(pack)
     rows = pack.rows("train")
     run = replace(run, augment=replace(run.augment, size=16))
     views = StepViews(run, pack, 1, torch.device("cpu")).make(rows, 0)

@@ -16,7 +16,7 @@ from mvitac.data.pack import Pack
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.lerobot import LeRobotConfig, choose
 from mvitac.datasets.table.table import RowsConfig
-from support.videos import film, shade
+from support.videos import film, level, shade
 
 
 def packed(config: RowsConfig, out: Path) -> Pack:
@@ -28,12 +28,6 @@ def png(value: int, size: tuple[int, int] = (20, 16)) -> bytes:
     Image.new("RGB", size, (value, value, value)).save(buffer, "PNG")
     return buffer.getvalue()
 
-
-def level(image: np.ndarray) -> float:
-    return float(image.mean())
-
-
-# -- LeRobot ----------------------------------------------------------------------------------------------------------
 
 FRONT, GEL = "observation.images.front", "observation.images.gelsight"
 LENGTHS = (12, 8, 10)
@@ -250,8 +244,7 @@ def test_image_parquet_of_the_hub(tmp_path: Path) -> None:
     root = make_hub(tmp_path / "data")
     config = FolderConfig(path=root, size=16, labels=("kind",), group="thing", vision="photo")
     pack = packed(config, tmp_path / "pack")
-    assert pack.num == 30
-    assert pack.spec.tasks[0].classes == ("metal", "wood")
+    assert pack.num == 30 and pack.spec.tasks[0].classes == ("metal", "wood")
     for row, i in enumerate(int(level(image)) for image in pack.images["touch"]):
         assert (pack.images["vision"][row] == 100 + i).all()
         assert pack.column("label_kind")[row] == (-1 if i == 4 else (1, 0)[i // 2 % 2])

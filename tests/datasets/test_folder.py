@@ -93,14 +93,10 @@ def packed(options: FolderConfig, out: Path, *, workers: int = 1) -> Pack:
     return build(options.source(), out, size=options.size, workers=workers, quiet=True)
 
 
-# -- content ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("options", [{"split": "side"}, {}, {"only": ("seq>=1",)}, {"only": ("object!=002", "seq=1")}])
 def test_every_image_stands_beside_its_own_row(tmp_path: Path, rows: Table, options: dict[str, Any]) -> None:
     pack = packed(config(write(rows, tmp_path / "manifest.csv"), **options), tmp_path / "pack")
-    assert pack.spec.touch_channels == 6
-    assert pack.spec.vision_channels == 3
+    assert pack.spec.touch_channels == 6 and pack.spec.vision_channels == 3
     for i, name in enumerate(pack.column("id")):
         row = int(name) - 1
         assert (pack.images["vision"][i] == colour(row, 0)).all()
@@ -110,7 +106,7 @@ def test_every_image_stands_beside_its_own_row(tmp_path: Path, rows: Table, opti
         assert (("metal", "wood", "")[label]) == rows[row]["material"]
 
 
-def test_csv_parquet_and_jsonl_give_one_pack(tmp_path: Path, rows: Table) -> None:
+def test_csv_parquet_and_jsonl_give_one_pack(tmp_path: Path) -> None:
     digests, options = set(), {"split": "side", "controls": ("width=width", "which=object"), "labels": ("stiffness",)}
     for suffix in ("csv", "parquet", "jsonl"):
         folder = tmp_path / suffix
@@ -140,9 +136,6 @@ def test_paths_are_relative_to_the_manifest_and_the_fingerprint_to_nothing(tmp_p
     before = config(tmp_path / place).place()
     Image.new("RGB", (64, 64), (1, 2, 3)).save(tmp_path / place / "vision" / "03.png")
     assert config(tmp_path / place).place() != before
-
-
-# -- files that change ------------------------------------------------------------------------------------------------
 
 
 def write_plain(folder: Path, level: int, when: int, *, suffix: str = "bmp") -> FolderConfig:
@@ -261,9 +254,6 @@ def test_a_config_survives_json(tmp_path: Path) -> None:
     assert from_json(Run, json.loads(json.dumps(to_json(run)))) == run
 
 
-# -- class folders ----------------------------------------------------------------------------------------------------
-
-
 def picture(path: Path, shade: int = 0) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.new("RGB", (16, 16), (shade, 0, 0)).save(path)
@@ -299,15 +289,10 @@ def test_class_folders_may_be_grouped_and_split(tmp_path: Path) -> None:
             for gel in ("left", "right"):
                 picture(tmp_path / split / gel / ("soft", "hard")[i % 2] / f"{split}{i // 4}" / f"{i}.png")
     pack = packed(FolderConfig(path=tmp_path, size=16), tmp_path / "pack")
-    assert pack.spec.touch_channels == 6
-    assert pack.spec.group_by == "group"
-    assert set(pack.column("group")) == {
-        f"{kind}/{s}{g}" for kind in ("soft", "hard") for s in ("train", "test") for g in "01"
-    }
+    assert pack.spec.touch_channels == 6 and pack.spec.group_by == "group"
+    expected = {f"{kind}/{split}{g}" for kind in ("soft", "hard") for split in ("train", "test") for g in "01"}
+    assert set(pack.column("group")) == expected
     assert all(split in group for split, group in zip(pack.column("split"), pack.column("group"), strict=True))
-
-
-# -- decoding ---------------------------------------------------------------------------------------------------------
 
 
 def test_sixteen_bits_are_scaled_not_clipped(tmp_path: Path) -> None:
@@ -348,8 +333,7 @@ def test_gray_palette_bilevel_and_alpha_become_rgb(tmp_path: Path) -> None:
     alpha[0, :, 3] = 0
     Image.fromarray(alpha).save(tmp_path / "alpha.png")
     seen = np.asarray(decode(tmp_path / "alpha.png"))
-    assert (seen[0] == 0).all()
-    assert (seen[1:] == np.asarray(rgb)[1:]).all()
+    assert (seen[0] == 0).all() and (seen[1:] == np.asarray(rgb)[1:]).all()
 
 
 @pytest.mark.parametrize("mode", ["RGB", "L"])
@@ -360,9 +344,7 @@ def test_exif_rotation_is_applied(tmp_path: Path, mode: str) -> None:
     exif[0x0112] = 6  # the camera was turned: rotate by 90 degrees clockwise to see it upright
     upright.transpose(Image.Transpose.ROTATE_90).save(tmp_path / "turned.png", exif=exif)
     seen = np.asarray(decode(tmp_path / "turned.png"))
-    assert seen.shape == (20, 30, 3)
-    assert (seen[:5] == 255).all()
-    assert (seen[5:] == 0).all()
+    assert seen.shape == (20, 30, 3) and (seen[:5] == 255).all() and (seen[5:] == 0).all()
 
 
 def test_shrunk_without_its_array_it_has_the_same_pixels(tmp_path: Path) -> None:
@@ -410,11 +392,7 @@ def test_a_damaged_image_is_named_or_counted(tmp_path: Path, rows: Table, kind: 
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "pack").exists()
     pack = build(source, tmp_path / "pack", size=16, quiet=True, max_damaged=0.1)
-    assert pack.num == NUM - 1
-    assert pack.meta["damaged"][0][0] == "row 5"
-
-
-# -- splits -----------------------------------------------------------------------------------------------------------
+    assert pack.num == NUM - 1 and pack.meta["damaged"][0][0] == "row 5"
 
 
 def test_dealt_splits_never_share_a_group() -> None:
@@ -434,8 +412,7 @@ def test_dealt_splits_never_share_a_group() -> None:
         assert {g for g, split in home.items() if split == "unlabelled"} == unlabelled
         num = len(home) - len(unlabelled)
         dealt = [split for split in home.values() if split != "unlabelled"]
-        assert dealt.count("test") <= np.ceil(num * test)
-        assert dealt.count("val") <= np.ceil(num * val)
+        assert dealt.count("test") <= np.ceil(num * test) and dealt.count("val") <= np.ceil(num * val)
 
 
 def test_dealing_is_stratified_and_the_shares_are_kept() -> None:
@@ -443,8 +420,7 @@ def test_dealing_is_stratified_and_the_shares_are_kept() -> None:
     target = [g % 4 for g in range(200)]
     for seed in range(5):
         splits = np.array(assign_splits(groups, [target], 0.25, 0.15, seed))
-        assert (splits == "test").sum() in range(48, 53)
-        assert (splits == "val").sum() in range(28, 33)
+        assert (splits == "test").sum() in range(48, 53) and (splits == "val").sum() in range(28, 33)
         for kind in range(4):
             assert (splits[np.array(target) == kind] == "test").sum() in range(11, 15)
     assert assign_splits(groups, [target], 0.25, 0.15, 0) != assign_splits(groups, [target], 0.25, 0.15, 1)
@@ -455,8 +431,7 @@ def test_a_leaking_split_is_refused_unless_allowed(tmp_path: Path, rows: Table) 
     file = write(rows, tmp_path / "m.csv")
     with pytest.raises(ValueError, match=r"leaks: 1 of 8 groups \(object\).*'000' in test and train.*by-group"):
         config(file, split="side").source()
-    assert config(file, split="side", allow_leak=True).source().items()
-    assert config(file).source().items()
+    assert config(file, split="side", allow_leak=True).source().items() and config(file).source().items()
 
 
 def test_another_way_to_write_a_path_hides_no_leak(tmp_path: Path, rows: Table) -> None:
@@ -471,8 +446,6 @@ def test_train_and_unlabelled_are_one_side(tmp_path: Path, rows: Table) -> None:
     rows[0]["side"] = "unlabelled"
     assert config(write(rows, tmp_path / "m.csv"), split="side").source().items()
 
-
-# -- every mistake is named before work begins ------------------------------------------------------------------------
 
 Change = Callable[[Table], object]
 
@@ -536,9 +509,8 @@ BAD_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("name", BAD_OPTIONS)
-def test_bad_options_are_named_at_once(name: str) -> None:
-    options, says = BAD_OPTIONS[name]
+@pytest.mark.parametrize(("options", "says"), BAD_OPTIONS.values(), ids=BAD_OPTIONS)
+def test_bad_options_are_named_at_once(options: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
         FolderConfig(**options)
 
@@ -551,14 +523,12 @@ BAD_FILES: dict[str, tuple[str, bytes, str]] = {
 }
 
 
-@pytest.mark.parametrize("name", BAD_FILES)
-def test_bad_files_are_named(tmp_path: Path, name: str) -> None:
-    file, content, says = BAD_FILES[name]
+@pytest.mark.parametrize(("file", "content", "says"), BAD_FILES.values(), ids=BAD_FILES)
+def test_bad_files_are_named(tmp_path: Path, file: str, content: bytes, says: str) -> None:
     (tmp_path / file).write_bytes(content)
     with pytest.raises(ValueError, match=says) as caught:
         FolderConfig(path=tmp_path / file).source()
-    assert "\n" not in str(caught.value)
-    assert file in str(caught.value)
+    assert "\n" not in str(caught.value) and file in str(caught.value)
 
 
 def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
@@ -622,8 +592,7 @@ def test_rows_that_share_something_are_told_where_no_group_is_given(tmp_path: Pa
     assert re.search(r"also in train: press \d of \d, names of vision files 4 of 4\)$", note)
     assert not FolderConfig(path=file, labels=("material",), group="press").source().spec().notes
     (note,) = FolderConfig(path=file, labels=("material",), group="shot", split_seed=1).source().spec().notes
-    assert (
-        note.startswith("column shot has another value in each row, so every row is its own group") and "press" in note
-    )
+    said = "column shot has another value in each row, so every row is its own group"
+    assert note.startswith(said) and "press" in note
     findings = examine_source(FolderConfig(path=file, labels=("material",), size=16).source(), quiet=True)
     assert [(f.verdict, f.item) for f in findings if "vision files" in f.evidence] == [("look", "groups")]

@@ -41,8 +41,7 @@ def test_holes_are_zeros_and_marked(holes: Pack) -> None:
 
 
 def test_a_pack_without_holes_has_everything(pack: Pack) -> None:
-    assert pack.has("vision").all() and pack.has("touch").all()
-    assert "has_touch" not in pack.table.column_names
+    assert pack.has("vision").all() and pack.has("touch").all() and "has_touch" not in pack.table.column_names
 
 
 @pytest.mark.parametrize("column", [True, None])
@@ -64,8 +63,7 @@ def test_training_sees_whole_pairs_only(holes: Pack, tmp_path: Path, monkeypatch
     run = replace(recipe("smoke", PackConfig(path=holes.path, size=32)), steps=4, eval_every=4, positives="same-touch")
     train(run, tmp_path / "run", quiet=True)
     whole = holes.has("vision") & holes.has("touch")
-    assert whole[seen].all()
-    assert set(seen) <= set(holes.rows("train", "unlabelled"))
+    assert whole[seen].all() and set(seen) <= set(holes.rows("train", "unlabelled"))
 
     found = draw_positives(holes, np.array(seen), torch.Generator().manual_seed(0))
     assert whole[found].all()

@@ -21,16 +21,12 @@ from mvitac.datasets.slip_grasp import SlipGraspConfig
 from mvitac.datasets.slip_gsmini import SlipGSMiniConfig
 from mvitac.datasets.table.splits import folds
 from mvitac.datasets.vt60 import VT60Config
-from support.videos import film, shade
+from support.videos import film, level, shade
 
 
 def plain(path: Path, value: int) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.new("RGB", (32, 24), (value, value, value)).save(path, quality=95)
-
-
-def level(image: np.ndarray) -> float:
-    return float(image.mean())
 
 
 def make_slip_grasp(root: Path) -> None:
@@ -138,12 +134,10 @@ def packs(clones: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, P
 @pytest.mark.parametrize("name", SETS)
 def test_the_contract(packs: dict[str, Pack], clones: Path, name: str) -> None:
     pack = packs[name]
-    assert pack.spec.name == name
-    assert pack.spec.source.startswith("https://github.com/")
+    assert pack.spec.name == name and pack.spec.source.startswith("https://github.com/")
     assert pack.spec.licence and pack.spec.licence != "unknown"
     groups = {split: set(pack.column("group")[pack.rows(split)]) for split in ("train", "val", "test")}
-    assert groups["train"] and groups["test"]
-    assert not groups["test"] & (groups["train"] | groups["val"])
+    assert groups["train"] and groups["test"] and not groups["test"] & (groups["train"] | groups["val"])
     for task in pack.spec.tasks:
         labels = pack.column(f"label_{task.name}")
         assert all((labels[pack.rows(split)] >= 0).any() for split in ("train", "test"))
@@ -178,10 +172,8 @@ def test_every_group_is_tested_once() -> None:
 
 def test_frames_are_counted_and_spread(tmp_path: Path) -> None:
     assert num_frames(film(tmp_path / "a.mov", 37)) == 37
-    assert spread(12, 450)[:3] == [0, 41, 82]
-    assert spread(12, 450)[-1] == 449
-    assert spread(8, 3) == [0, 1, 2]
-    assert spread(3, 101, 0.25, 0.75) == [25, 50, 75]
+    assert spread(12, 450)[:3] == [0, 41, 82] and spread(12, 450)[-1] == 449
+    assert spread(8, 3) == [0, 1, 2] and spread(3, 101, 0.25, 0.75) == [25, 50, 75]
     (tmp_path / "b.mov").write_text("nothing")
     with pytest.raises(ValueError, match=r"b\.mov cannot be read as a video"):
         num_frames(tmp_path / "b.mov")
@@ -207,9 +199,8 @@ def test_slip_grasp_pairs_by_frame(packs: dict[str, Pack]) -> None:
         expected = seq[i] + 25 * late[i]
         assert abs(level(pack.images["vision"][i]) - expected) < 3
         assert abs(level(pack.images["touch"][i]) - expected - 100) < 3
-    assert set(pack.column("touch_group")) == {
-        f"{k + 1:03d}_04{k}_{2 * g}0" for k in range(4) for g in range(3 + k % 2)
-    }
+    grasps = {f"{k + 1:03d}_04{k}_{2 * g}0" for k in range(4) for g in range(3 + k % 2)}
+    assert set(pack.column("touch_group")) == grasps
     first = pack.column("group") == "001"
     assert np.isclose(np.unique(pack.column("width_in_sweep")[first]), [-0.2, 0.0, 0.2]).all()
     assert pack.spec.controls["width"] == ("width_mm",)
@@ -217,8 +208,7 @@ def test_slip_grasp_pairs_by_frame(packs: dict[str, Pack]) -> None:
 
 def test_slip_gsmini_counts_copies_once(packs: dict[str, Pack]) -> None:
     pack = packs["slip_gsmini"]
-    assert pack.num == 9 * 2 * 12
-    assert pack.spec.touch_channels == 6
+    assert pack.num == 9 * 2 * 12 and pack.spec.touch_channels == 6
     assert set(pack.column("group")) == {"bag_peanuts", *(f"thing_{k}" for k in range(9) if k != 3)}
     for i in range(0, pack.num, 5):
         thing, n = pack.column("group")[i], int(pack.column("experiment")[i][-1])

@@ -17,10 +17,8 @@ GEL, FRONT, WRENCH = "/digit/image_raw", "/camera/image/compressed", "/ft/wrench
 
 def wrench(time: float, fz: float) -> Any:
     vector, kind = STORE.types["geometry_msgs/msg/Vector3"], STORE.types["geometry_msgs/msg/WrenchStamped"]
-    force = STORE.types["geometry_msgs/msg/Wrench"](
-        force=vector(x=0.0, y=1.0, z=fz), torque=vector(x=0.0, y=0.0, z=0.0)
-    )
-    return kind(header=stamped(time), wrench=force)
+    force, torque = vector(x=0.0, y=1.0, z=fz), vector(x=0.0, y=0.0, z=0.0)
+    return kind(header=stamped(time), wrench=STORE.types["geometry_msgs/msg/Wrench"](force=force, torque=torque))
 
 
 def write_bag(path: Path, plugin: StoragePlugin, number: int, pixels: Any = None) -> Path:

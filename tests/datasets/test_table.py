@@ -19,7 +19,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.table import table as rows_module
-from support.videos import film, shade
+from support.videos import film, level, shade
 
 Table = list[dict[str, Any]]
 
@@ -41,10 +41,6 @@ def table(file: Path, rows: Table) -> Path:
 def packed(path: Path, out: Path, *, workers: int = 1, **options: Any) -> Pack:
     config = FolderConfig(path=path, size=16, **options)
     return build(config.source(), out, size=16, workers=workers, quiet=True)
-
-
-def level(image: np.ndarray) -> float:
-    return float(image.mean())
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +116,7 @@ def test_videos_that_a_row_shows_side_by_side_are_one_group(films: Path) -> None
     assert len(set(groups.values())) == 3 and groups["000001"] == groups["000005"]  # both seen by camera 0
 
 
-def test_a_split_that_cuts_a_video_is_refused_and_seen_by_the_doctor(films: Path, tmp_path: Path) -> None:
+def test_a_split_that_cuts_a_video_is_refused_and_seen_by_the_doctor(films: Path) -> None:
     frames = [(k, i) for k in range(4) for i in range(12)]
     rows = [{"touch": f"{k}/gel.avi", "frame": i, "split": "test" if i > 8 else "train"} for k, i in frames]
     config = FolderConfig(path=table(films / "cut.csv", rows), size=16)
@@ -199,8 +195,7 @@ def test_a_row_may_lack_a_modality(tmp_path: Path) -> None:
         packed(half, tmp_path / "no", labels=("label",), group="object", allow_missing=True)
     pack = packed(file, tmp_path / "pack", labels=("label",), group="object", allow_missing=True)
     numbers = pack.column("id").astype(int) - 1
-    assert (pack.has("vision") == (numbers % 6 != 1)).all()
-    assert (pack.has("touch") == (numbers % 6 != 2)).all()
+    assert (pack.has("vision") == (numbers % 6 != 1)).all() and (pack.has("touch") == (numbers % 6 != 2)).all()
     for i, number in enumerate(numbers):
         assert (pack.images["vision"][i] == (10 + number) * pack.has("vision")[i]).all()
         assert (pack.images["touch"][i, :, :, 3:] == (200 + number) * pack.has("touch")[i]).all()
@@ -211,8 +206,7 @@ def test_differences_are_halved_around_the_middle() -> None:
     image, background = (np.repeat(v.reshape(256, 256, 1), 3, 2) for v in np.meshgrid(values, values))
     exact = (image.astype(float) - background) / 2 + 127.5
     found = difference(image, background)
-    assert (np.abs(found - exact) <= 0.5).all()
-    assert (found[image == background] == 128).all()
+    assert (np.abs(found - exact) <= 0.5).all() and (found[image == background] == 128).all()
     assert found.min() == 0 and found.max() == 255
 
 
@@ -248,8 +242,7 @@ def test_backgrounds_by_sensor(tmp_path: Path) -> None:
     rows = pressed(tmp_path)
     options: dict[str, Any] = {"labels": ("label",), "difference": True, "no_contact": ("phase=empty",)}
     pack = packed(table(tmp_path / "m.csv", rows), tmp_path / "p", **options)
-    assert pack.num == 20
-    assert set(pack.column("sensor")) == {"digit", "mini"}
+    assert pack.num == 20 and set(pack.column("sensor")) == {"digit", "mini"}
     for i, name in enumerate(pack.column("id")):
         number = int(name) - 1
         base = (60, 180)[number // 12]  # the mean of base - 1 and base + 1

@@ -141,9 +141,8 @@ def test_dropped_frames_do_not_shift_a_window() -> None:
 
 def test_the_background_stands_for_the_first_frame() -> None:
     found = play(Seeing(frames=2, minus_first=True), EVEN)
-    levels = [
-        difference(np.full((1, 1, 3), 60 + k, np.uint8), np.full((1, 1, 3), 10, np.uint8))[0, 0, 0] for k in (14, 13)
-    ]
+    free, *later = (np.full((1, 1, 3), value, np.uint8) for value in (10, 60 + 14, 60 + 13))
+    levels = [difference(image, free)[0, 0, 0] for image in later]
     assert [level + 60 for level in found[-1]] == levels
     with pytest.raises(ValueError, match="background of touch alone"):
         play(Seeing(minus_first=True, of=["touch", "vision"]), [])

@@ -19,7 +19,6 @@ import mvitac
 import mvitac.deploy.export as exports
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
-from mvitac.datasets.pack import PackConfig
 from mvitac.deploy import engine as runtime
 from mvitac.deploy import publish
 from mvitac.deploy.artifact import ARTIFACT
@@ -30,9 +29,9 @@ from mvitac.deploy.publish import with_probes
 from mvitac.evaluation.probe import score_rows, split_rows
 from mvitac.model import Model, fresh
 from mvitac.nn.linear_probe import Error
-from mvitac.recipes import recipe
 from support.processes import begin, finish
 from support.toy import renumbered, toy_pack
+from support.training_runs import smoke
 
 EXACT = {"min_cosine": 0.9999, "accuracy_loss": 0.0}
 
@@ -75,9 +74,8 @@ def int8(model: Model, onnx: Path, pack: Pack, tmp_path_factory: pytest.TempPath
 def test_the_resize_in_the_graph_is_the_probes_pixel_by_pixel(stored: int, model: Model) -> None:
     from mvitac.transforms.random_views import plain_view
 
-    images = torch.randint(
-        0, 256, (3, 3, stored, stored), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
-    )
+    generator = torch.Generator().manual_seed(0)
+    images = torch.randint(0, 256, (3, 3, stored, stored), dtype=torch.uint8, generator=generator)
     was, model.stored = model.stored, stored
     try:
         graph = ExportModule(model)
@@ -175,7 +173,7 @@ def test_export_of_touch_alone(smoke_run: Path, pack: Pack, tmp_path: Path) -> N
 
 def test_two_sensors_are_normalised_alike(tmp_path: Path) -> None:
     pack = toy_pack(tmp_path / "p", touch_channels=6, num=90)
-    model = with_probes(fresh(recipe("smoke", PackConfig(path=pack.path)), pack.spec, pack.size).eval(), pack)
+    model = with_probes(fresh(smoke(pack), pack.spec, pack.size).eval(), pack)
     assert check(model, ExportModule(model), pack)["cosine"]["embedding_touch"]["min"] > 0.9999
 
 
@@ -271,8 +269,7 @@ def test_the_spread_of_a_prediction_is_that_of_test_rows_in_its_range(
     found = model.predict(touch=measured.images["touch"][rows])["light"][:, 0].numpy()
     off = found - measured.values(task)[rows, 0]
     (error,) = model.probes["light.touch"].info.errors
-    assert len(error.spread) == len(rows) // 5 > 2
-    assert min(error.spread) <= error.rmse <= max(error.spread)
+    assert len(error.spread) == len(rows) // 5 > 2 and min(error.spread) <= error.rmse <= max(error.spread)
     for value in found:
         same = np.searchsorted(error.edges, found, side="right") == np.searchsorted(error.edges, value, side="right")
         assert spread_at(vars(error), value) == pytest.approx(float((off[same] ** 2).mean() ** 0.5), rel=1e-3)
@@ -317,9 +314,8 @@ def test_an_export_that_changes_a_value_is_refused(value_artifact: Path, measure
         found[-1] = found[-1] + np.array([0, 0.2 * std], np.float32)  # of task both: the weight alone
         return found
 
-    with pytest.raises(
-        ValueError, match=f"changes weight by {0.2 * std:.3g} N .* at most {0.1 * std:.3g} is .*--value-loss"
-    ):
+    says = f"changes weight by {0.2 * std:.3g} N .* at most {0.1 * std:.3g} is .*--value-loss"
+    with pytest.raises(ValueError, match=says):
         parity(graph, call, measured, rows, wanted, min_cosine=0.99)
     report = parity(graph, call, measured, rows, wanted, min_cosine=0.99, value_loss=0.3)
     assert report["values"]["both"][1]["change"] == pytest.approx(0.2 * std, rel=1e-3)

@@ -15,7 +15,6 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack
 from mvitac.data.source import Sample
-from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import Materials, MaterialsConfig
 from mvitac.deploy.engine import Engine, about_sensor
 from mvitac.deploy.publish import with_probes
@@ -26,11 +25,11 @@ from mvitac.live.predictor import Live
 from mvitac.live.recorder import Recorder
 from mvitac.live.streams import Stream
 from mvitac.model import Model, load
-from mvitac.recipes import recipe
 from mvitac.sim import materials
 from mvitac.sim.sensors import SENSORS
 from mvitac.training.loop import train
 from support.faults import Clock
+from support.training_runs import smoke
 
 pytestmark = pytest.mark.slow
 OPTION = "--new-sensor"
@@ -59,7 +58,7 @@ def new(tmp_path_factory: pytest.TempPathFactory) -> Pack:
 
 @pytest.fixture(scope="module")
 def run(old: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = replace(recipe("smoke", PackConfig(path=old.path)), steps=4, eval_every=0)
+    run = smoke(old, steps=4, eval_every=0)
     return train(run, tmp_path_factory.mktemp("run") / "run", quiet=True, validate=False)
 
 

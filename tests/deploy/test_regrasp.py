@@ -11,11 +11,10 @@ import pytest
 from mvitac.data.build import build
 from mvitac.data.source import Sample
 from mvitac.data.spec import DataSpec
-from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import Grasps, GraspsConfig
 from mvitac.model import fresh
-from mvitac.recipes import recipe
 from support.examples import load_example
+from support.training_runs import smoke
 
 regrasp = load_example("regrasp")
 THINGS, EACH = 40, 5
@@ -48,7 +47,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("felt")
     pack = build(Felt(), folder / "pack", size=16, quiet=True)
     (folder / "run").mkdir()
-    fresh(recipe("smoke", PackConfig(path=pack.path)), pack.spec, pack.size).save(folder / "run" / "model.safetensors")
+    fresh(smoke(pack), pack.spec, pack.size).save(folder / "run" / "model.safetensors")
     return folder / "run"
 
 

@@ -173,11 +173,9 @@ def test_groups_without_rows_do_not_count() -> None:
 
 def test_collapsed_features_look_collapsed_and_isotropic_ones_spread() -> None:
     same = torch.ones(50, 8)
-    assert d.spread(same) == pytest.approx(0, abs=1e-6)
-    assert d.rank_me(same) == pytest.approx(1, abs=1e-3)
+    assert d.spread(same) == pytest.approx(0, abs=1e-6) and d.rank_me(same) == pytest.approx(1, abs=1e-3)
     z = torch.randn(4000, 16, generator=torch.Generator().manual_seed(0))
-    assert d.spread(z) == pytest.approx(1, abs=0.03)
-    assert d.rank_me(z) == pytest.approx(16, abs=0.2)
+    assert d.spread(z) == pytest.approx(1, abs=0.03) and d.rank_me(z) == pytest.approx(16, abs=0.2)
     assert d.rank_me(torch.eye(7)) == pytest.approx(7, rel=1e-4)
 
 

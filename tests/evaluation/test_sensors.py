@@ -14,7 +14,6 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack, MixedPack
 from mvitac.data.source import Sample
-from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation import sensors as module
 from mvitac.evaluation.features import features
 from mvitac.evaluation.sensors import (
@@ -27,10 +26,10 @@ from mvitac.evaluation.sensors import (
 )
 from mvitac.model import Model, load
 from mvitac.nn.initial import Init
-from mvitac.recipes import recipe
 from mvitac.run import load_run
 from mvitac.training.loop import train
 from support.toy import Toy
+from support.training_runs import smoke
 
 
 class Others(Toy):
@@ -47,13 +46,11 @@ class Others(Toy):
 def with_columns(pack: Pack, **columns: np.ndarray) -> Pack:
     """``pack`` with other columns in its table, in memory."""
     made = copy.copy(pack)
-    made.__dict__ = {
-        k: v for k, v in pack.__dict__.items() if k not in ("sensors", "sensor_names", "presses", "_rows_by")
-    }
-    kept = pack.table.drop_columns([name for name in columns if name in pack.table.column_names])
+    cached = ("sensors", "sensor_names", "presses", "_rows_by")
+    made.__dict__ = {name: value for name, value in pack.__dict__.items() if name not in cached}
+    made.table = pack.table.drop_columns([name for name in columns if name in pack.table.column_names])
     for name, values in columns.items():
-        kept = kept.append_column(name, pa.array(values.tolist()))
-    made.table = kept
+        made.table = made.table.append_column(name, pa.array(values.tolist()))
     return made
 
 
@@ -73,14 +70,13 @@ def test_models_keep_sensors_of_their_training_rows(smoke_run: Path, pack: Pack,
     assert load_run(smoke_run)[1]["data"]["sensors"] == ["toy"]
     for modality, known in (("touch", ("negative", "plain", "toy")), ("vision", ("negative", "plain"))):
         init = Init(path=smoke_run, modalities=(modality,))
-        run = replace(recipe("smoke", PackConfig(path=others.path)), steps=1, init=init, eval_every=1)
+        run = smoke(others, steps=1, init=init, eval_every=1)
         started = train(run, tmp_path / modality, quiet=True)
         assert load(started).spec.sensors == load(started, "best").spec.sensors == known
     assert pack.spec.sensors == ()
     model = load(smoke_run)
-    assert about_new(model, pack) == "" and "negative, plain is new to the model, which knows toy" in about_new(
-        model, others
-    )
+    assert about_new(model, pack) == ""
+    assert "negative, plain is new to the model, which knows toy" in about_new(model, others)
     model.spec = replace(model.spec, sensors=("other",))
     assert "toy is named by no column sensor and may be new to the model, which knows other" in about_new(model, pack)
     model.spec = replace(model.spec, sensors=())
@@ -109,9 +105,8 @@ def test_statistics_never_take_test_images_while_there_are_others(others: Pack) 
 
 def test_joined_packs_take_statistics_from_hidden_rows(pack: Pack, others: Pack) -> None:
     """Of the scored pack: its train rows, which a joined pack hides, and no test row."""
-    both = JoinedPack(
-        with_columns(pack, sensor=np.full(pack.num, "old")), with_columns(others, sensor=np.full(120, "new"))
-    )
+    named = (pack, "old"), (others, "new")
+    both = JoinedPack(*(with_columns(part, sensor=np.full(part.num, name)) for part, name in named))
     assert both.sensor_names == ("new", "old")
     new, old = (unlabelled_rows(both, number) for number in (0, 1))
     assert (new >= pack.num).all() and set(both.column("split")[new]) == {"hidden"}
@@ -126,11 +121,8 @@ def test_features_are_standardised_by_each_sensors_own_images(model: Model, othe
         own = others.sensors[rows] == number
         expected = (features(model, others, "touch", rows[own]) - seen.mean(0)) / seen.std(0)
         np.testing.assert_allclose(found[own], expected, rtol=1e-5, atol=1e-5)
-    for modality, kinds in (
-        ("vision", ("features",)),
-        ("touch", ()),
-        ("touch", ("colours",)),
-    ):  # colours: no new sensor here
+    unchanged = ("vision", ("features",)), ("touch", ()), ("touch", ("colours",))  # colours: no new sensor here
+    for modality, kinds in unchanged:
         plain = touch_features(model, others, modality, rows, kinds)  # type: ignore[arg-type]
         np.testing.assert_allclose(plain, features(model, others, modality, rows), rtol=1e-5, atol=1e-6)
 
@@ -156,9 +148,8 @@ def test_new_sensors_are_shown_as_each_known_one(
     both_kinds = touch_features(model, both, "touch", rows, ("features", "colours"))
     seen = np.mean([features(model, look, "touch", unlabelled_rows(both, 2)) for look in both.looks], axis=0)
     new = rows >= 120
-    np.testing.assert_allclose(
-        both_kinds[new], (found[new] - seen.mean(0)) / (seen.std(0) + 1e-6), rtol=1e-3, atol=1e-3
-    )
+    expected = (found[new] - seen.mean(0)) / (seen.std(0) + 1e-6)
+    np.testing.assert_allclose(both_kinds[new], expected, rtol=1e-3, atol=1e-3)
     with pytest.raises(ValueError, match=r"all sensors of .* are in"):
         RecolouredPack(learn, with_columns(others, sensor=np.full(120, "lit")))
 

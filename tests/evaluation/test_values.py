@@ -14,15 +14,14 @@ from sklearn.preprocessing import StandardScaler
 from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack
 from mvitac.data.spec import Target
-from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.intervals import interval, paired_difference
 from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.regressors import fit_curve, fit_ridge
 from mvitac.evaluation.scores import pool
 from mvitac.evaluation.value_scores import r2_without_each_group, score_values
-from mvitac.recipes import recipe
 from mvitac.training.loop import train
+from support.training_runs import smoke
 
 NEWTON = (Target(name="force_n", unit="N"),)
 POSE = (Target(name="z_mm", unit="mm"), Target(name="tilt_deg", unit="deg"))
@@ -74,8 +73,7 @@ def test_the_interval_of_r2_holds_it_and_a_worse_method_is_told_apart() -> None:
         for g in (guess, guess + noise)
     )
     mean, low, high = interval(good[:1])
-    assert low < mean < high < 1
-    assert mean == pytest.approx(r2_score(y, guess))
+    assert low < mean < high < 1 and mean == pytest.approx(r2_score(y, guess))
     difference, low, high, p = paired_difference(good, bad)
     assert 0 < low < difference < high and p is not None and p < 0.05
     assert paired_difference(good[:1], bad[:1])[3] is None
@@ -152,8 +150,7 @@ def test_features_that_few_rows_have_are_worth_what_plain_ridge_makes_of_them() 
 def test_a_control_may_be_a_curve() -> None:
     x = np.linspace(-1, 1, 200)[:, None]
     y = x**2
-    assert r2_score(y, fit_curve(x, y, 50)(x)) > 0.99
-    assert r2_score(y, fit_ridge(x, y, 50)[0](x)) < 0.1
+    assert r2_score(y, fit_curve(x, y, 50)(x)) > 0.99 and r2_score(y, fit_ridge(x, y, 50)[0](x)) < 0.1
 
 
 @pytest.mark.parametrize(("scale", "offset"), [(1e300, 0), (1e-300, 0), (1, 1e12)])
@@ -167,7 +164,7 @@ def test_values_that_rounding_would_score_are_refused(scale: float, offset: floa
 
 
 def test_probes_of_classes_and_values_side_by_side(measured: Pack, tmp_path: Path) -> None:
-    run = replace(recipe("smoke", PackConfig(path=measured.path)), steps=2, eval_every=0)
+    run = smoke(measured, steps=2, eval_every=0)
     asked = ProbeConfig(probes=("linear", "paper", "knn"), modalities=("touch",))
     result = probe_runs([train(run, tmp_path / "run", quiet=True)], asked)
     found = {(r["task"], r["source"], r["modality"], r["probe"]): r for r in result["records"]}
@@ -200,7 +197,6 @@ def test_folds_are_pooled_to_the_scores_of_all_groups_together() -> None:
     (pooled,) = pool(folds)
     whole = score_values(y, guess, groups, POSE)
     for found, wanted in zip(pooled["targets"], whole["targets"], strict=True):
-        assert {k: found[k] for k in ("r2", "mae", "rmse")} == pytest.approx(
-            {k: wanted[k] for k in ("r2", "mae", "rmse")}
-        )
+        for name in ("r2", "mae", "rmse"):
+            assert found[name] == pytest.approx(wanted[name])
     assert interval([pooled]) == pytest.approx(interval([{**about, **whole}]))

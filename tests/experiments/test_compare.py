@@ -45,6 +45,7 @@ from support.small_plans import ROWS, small
 from support.toy import Toy, toy_pack
 
 TABLE1, TABLE2, ABLATION = map(find_plan, PLANS[:3])
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture(scope="module")
@@ -135,9 +136,7 @@ def test_a_row_may_read_the_same_samples_in_another_way(pack: Pack, tmp_path: Pa
     assert {"MViTac", "darker"} <= sources
 
 
-@pytest.mark.parametrize(
-    "file", sorted((Path(__file__).parents[2] / "examples").glob("*.toml")), ids=lambda file: file.stem
-)
+@pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.toml")), ids=lambda file: file.stem)
 def test_plans_of_the_examples_name_settings_that_exist(file: Path) -> None:
     plan = find_plan(str(file))
     for row in plan.rows:
@@ -147,7 +146,7 @@ def test_plans_of_the_examples_name_settings_that_exist(file: Path) -> None:
 
 @pytest.mark.parametrize("name", ["force", "pose"])
 def test_methods_of_these_plans_see_equally_many_images(pack: Pack, name: str) -> None:
-    plan = find_plan(str(Path(__file__).parents[2] / "examples" / f"{name}.toml"))
+    plan = find_plan(str(EXAMPLES / f"{name}.toml"))
     spec, seen = replace(pack.spec, vision_channels=0), {}
     for row in plan.rows:
         run = plan.run(row, PackConfig(), 0, phased=False)
@@ -484,8 +483,7 @@ def test_the_command_from_dry_run_to_tables(pack: Pack, tmp_path: Path, capsys: 
     words = command(pack, plan, tmp_path / "out")
     assert main([*words, "--dry-run"]) == 0
     shown = capsys.readouterr().out
-    assert "2 rows x 1 seeds = 2 runs" in shown and not (tmp_path / "out").exists()
-    assert "2 runs left" in shown
+    assert "2 rows x 1 seeds = 2 runs" in shown and not (tmp_path / "out").exists() and "2 runs left" in shown
     assert main([*words, "--tables-only"]) == 2
     assert "no run of" in capsys.readouterr().err
     assert main([*words, "--set", "steps=1", "--seeds", "1"]) == 0
@@ -549,9 +547,8 @@ def test_folds_are_run_apart_and_pooled(two_folds: Path, tmp_path: Path, capsys:
     assert one["group_correct"] == apart[0]["group_correct"] + apart[1]["group_correct"]
     assert one["accuracy"] == pytest.approx((apart[0]["accuracy"] + apart[1]["accuracy"]) / 2)
     assert one["auroc"] == pytest.approx((apart[0]["auroc"] + apart[1]["auroc"]) / 2)
-    assert one["balanced_accuracy"] == pytest.approx(
-        np.mean([row[k] / sum(row) for k, row in enumerate(one["confusion"])])
-    )
+    recalls = [row[k] / sum(row) for k, row in enumerate(one["confusion"])]
+    assert one["balanced_accuracy"] == pytest.approx(np.mean(recalls))
     (out / "fold2/runs/simclr/seed1/scores.json").unlink()
     (out / "fold2/runs/simclr/seed1/model.safetensors").unlink()
     main(["compare", "--plan", str(two_folds), "--out", str(out), "--tables-only"])

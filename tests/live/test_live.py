@@ -84,8 +84,7 @@ def test_the_newest_frame_wins_and_the_rest_are_counted(engine: Engine) -> None:
     assert age["p50"] == pytest.approx(4, abs=0.01) and age["max"] >= age["p99"] >= age["p50"]
     vision, touch = (world.streams[m][0] for m in ("vision", "touch"))
     assert touch.num_dropped == 0
-    assert vision.num_dropped == pytest.approx(500, abs=12)
-    assert vision.num_frames == pytest.approx(600, abs=2)
+    assert vision.num_dropped == pytest.approx(500, abs=12) and vision.num_frames == pytest.approx(600, abs=2)
 
 
 def test_old_frames_are_not_used(engine: Engine) -> None:
@@ -95,8 +94,7 @@ def test_old_frames_are_not_used(engine: Engine) -> None:
     world.run(0.4)
     before = world.live.num_predictions, world.live.num_stale
     world.run(6)
-    assert world.live.num_stale > before[1] + 40
-    assert world.live.num_predictions <= before[0] + 3
+    assert world.live.num_stale > before[1] + 40 and world.live.num_predictions <= before[0] + 3
     assert world.streams["vision"][0].fault == "stalled"
     world.rigs["vision"].fault = ""
     world.run(6)
@@ -111,8 +109,7 @@ def test_a_touch_ends_with_its_stream(engine: Engine) -> None:
         assert world.live.touch is not None and world.live.contact
         world.rigs["touch"].fault = fault
         world.run(1)
-        assert world.live.touch is None and world.live.last is not None
-        assert world.live.contact is None
+        assert world.live.touch is None and world.live.last is not None and world.live.contact is None
 
 
 def test_a_frame_that_comes_while_others_are_taken_is_used_once(engine: Engine) -> None:
@@ -473,8 +470,7 @@ def test_a_value_is_that_of_the_newest_frame_with_the_spread_of_its_range(measur
             said = json.loads(json.dumps(world.live.prediction()))
             found.append(said["light"]["level"])
     assert found == [{"value": v, "unit": "N", "spread": s} for v, s in ((1.0, 0.25), (5.0, 0.5), (3.0, 0.5))]
-    assert said["contact"] is True
-    assert said["pattern"]["class"] in measuring.classes["pattern"]
+    assert said["contact"] is True and said["pattern"]["class"] in measuring.classes["pattern"]
     while world.live.touch:
         world.run(0.1)
     assert world.live.prediction() == {"touch": 1, "contact": False}

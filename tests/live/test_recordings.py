@@ -59,8 +59,7 @@ def whole(tables: Any) -> dict[str, np.ndarray]:
 def test_every_frame_is_answered_as_the_engine_answers_it(engine: Engine, films: dict[str, Path]) -> None:
     """With the nearest frame of the camera, and contact known from the first frame on."""
     table = whole(Recordings(engine, opened(films), FIRST).tables())
-    assert table["frame"].tolist() == list(range(NUM))
-    assert table["time"] == pytest.approx(np.arange(NUM) / 25)
+    assert table["frame"].tolist() == list(range(NUM)) and table["time"] == pytest.approx(np.arange(NUM) / 25)
     assert table["contact"].tolist() == [False] * FREE + [True] * (NUM - FREE)
     assert table["touch"].tolist() == [0] * FREE + [1] * (NUM - FREE)
     images = {m: dict(frames(path, range(NUM), lost={})) for m, path in films.items()}

@@ -47,9 +47,6 @@ def dot(a: list[float], b: list[float]) -> float:
     return sum(x * y for x, y in zip(a, b, strict=True))
 
 
-# -- memory -----------------------------------------------------------------------------------------------------------
-
-
 def test_queue_holds_the_last_keys_and_wraps() -> None:
     queue = Queue(5, 2)
     keys = torch.randn(9, 2)
@@ -59,9 +56,6 @@ def test_queue_holds_the_last_keys_and_wraps() -> None:
     assert held == {tuple(round(v, 5) for v in row) for row in unit(keys[4:])}
     queue.push(torch.randn(11, 2))  # more than it holds
     assert torch.allclose(queue.keys.norm(dim=1), torch.ones(5))
-
-
-# -- CMC --------------------------------------------------------------------------------------------------------------
 
 
 def slow_nce(scores: list[list[float]], num_rows: int) -> float:
@@ -108,13 +102,8 @@ def test_cmc_equals_a_direct_transcription(softmax: bool) -> None:
         for modality, bank in method.banks.items():
             moved = (bank.values != banks[modality]).any(dim=1).nonzero().flatten().tolist()
             assert moved == sorted(at)
-            new = [
-                unit((0.5 * banks[modality][j] + 0.5 * torch.tensor(z[modality][i]))[None])[0] for i, j in enumerate(at)
-            ]
+            new = unit(0.5 * banks[modality][at] + 0.5 * torch.tensor(z[modality]))
             torch.testing.assert_close(bank.values[at], torch.tensor(new), rtol=1e-4, atol=1e-5)
-
-
-# -- SSVTP, SimCLR, MoCo, MCT -----------------------------------------------------------------------------------------
 
 
 def test_ssvtp_is_the_mean_of_both_directions() -> None:
@@ -194,9 +183,6 @@ def test_mct_crosses_modalities_through_the_inter_heads() -> None:
     )
 
 
-# -- BYOL, DINO, VICReg -----------------------------------------------------------------------------------------------------
-
-
 def distance(p: torch.Tensor, t: torch.Tensor) -> float:
     """The mean squared distance of unit vectors."""
     rows = zip(unit(p), unit(t), strict=True)
@@ -272,9 +258,6 @@ def test_vicreg_weighs_its_terms() -> None:
     s = (a - b).square().mean()
     expected = 3 * s + 5 * (variance(a) + variance(b)) / 2 + 7 * (covariance(a) + covariance(b))
     torch.testing.assert_close(found["touch"], expected, rtol=1e-4, atol=1e-4)
-
-
-# -- supervised references --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("config", [SupervisedConfig, CalandraConfig])

@@ -168,9 +168,8 @@ def test_ijepa_is_smooth_l1_to_the_teachers_normalised_tokens() -> None:
         context = {m: next(live(blocks[m], i)) for m in errors}
         seen = {m: seen_alone(method.trunks[m], batch.images[m][0][i], context[m]) for m in errors}
         for m in ("vision", "touch"):
-            whole = (
-                seen_alone(method.teachers[m].module, batch.images[m][0][i], torch.arange(16)).detach().double().numpy()
-            )  # type: ignore[arg-type]
+            teacher, image = method.teachers[m].module, batch.images[m][0][i]
+            whole = seen_alone(teacher, image, torch.arange(16)).detach().double().numpy()  # type: ignore[arg-type]
             normal = (whole - whole.mean(1, keepdims=True)) / np.sqrt(whole.var(1, keepdims=True) + 1e-5)
             for block in list(live(blocks[m], i))[1:]:
                 guess = slow_predictor(method.predictors[m], seen[m], context[m], block)  # type: ignore[arg-type]

@@ -75,7 +75,6 @@ def test_no_key_parameter_is_optimised_or_gets_a_gradient() -> None:
     assert optimised == {id(p) for p in method.query.parameters()}
     method(views(method))["loss"].backward()
     assert all(p.grad is None for p in method.key.parameters())
-    assert all(p.grad is not None for p in method.query.parameters())
     for tower in method.query.values():  # inside the blocks some start at zero: timm zeroes each block's last BatchNorm
         assert all(p.grad.abs().sum() > 0 for head in (tower.intra, tower.inter) for p in head.parameters())
         assert tower.trunk.conv1[0].weight.grad.abs().sum() > 0

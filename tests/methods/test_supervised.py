@@ -118,9 +118,8 @@ def test_the_own_head_is_trained_and_scored_in_the_unit(measured: Pack, tmp_path
     # A pack with the targets in another order, and one whose unit differs.
     turned = replace(both, targets=both.targets[::-1])
     record = next(r for r in probe_model(model, measured, [turned], ["both"], []) if r["probe"] == "own")
-    assert [found["r2"] for found in record["targets"]] == pytest.approx(
-        [f["r2"] for f in own["both"]["targets"]][::-1]
-    )
+    first, second = (found["r2"] for found in own["both"]["targets"])
+    assert [found["r2"] for found in record["targets"]] == pytest.approx([second, first])
     other = replace(both, targets=tuple(replace(target, unit="kN") for target in both.targets))
     assert not probe_model(model, measured, [other], ["both"], [])
 

@@ -216,9 +216,8 @@ def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
     (first / "log.jsonl").unlink()
     result = probe_runs([first, second], ProbeConfig(probes=("knn", "linear"), controls=False))
     page = Page(write_report([first, second], tmp_path / "out", result=result, quiet=True).read_text())
-    assert "supervised, mvitac on noise" in page.text
-    assert "The same by logistic regression" in page.text
-    assert "parts of the loss, mvitac" in page.text
+    for text in ("supervised, mvitac on noise", "The same by logistic regression", "parts of the loss, mvitac"):
+        assert text in page.text
     linear, nearest = (summarise(result["records"], kind)["kind"]["both"] for kind in ("linear", "knn"))
     for cells in (linear, nearest):
         assert cell_text({"both": cells}, "mvitac", "both") in page.text.replace("\xa0", " ")

@@ -97,9 +97,8 @@ def test_targets_have_scores_of_their_own(scored: tuple[Path, Pack, dict[str, An
     (record,) = (r for r in result["records"] if (r["task"], r["source"], r["modality"]) == ("both", "pixels", "touch"))
     assert cell["mean"] == pytest.approx(np.mean([target["mean"] for target in cell["targets"]]))
     for found, target in zip(cell["targets"], record["targets"], strict=True):
-        assert (found["mean"], found["mae"], found["rmse"]) == pytest.approx(
-            (target["r2"], target["mae"], target["rmse"])
-        )
+        wanted = target["r2"], target["mae"], target["rmse"]
+        assert (found["mean"], found["mae"], found["rmse"]) == pytest.approx(wanted)
         assert found["low"] < found["mean"] < found["high"]
 
 

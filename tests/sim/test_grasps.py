@@ -54,8 +54,7 @@ def test_every_kind_of_thing_rests_still_before_the_grip():
 
 def test_sensors_are_drawn_from_one_side_and_leave_physics_and_camera_alone():
     usual, held_out = (grasps.grasp(0, 8, 2, size=SIZE, held_out_sensor=h) for h in (False, True))
-    assert not SENSORS[usual[0]["sensor"]].held_out
-    assert SENSORS[held_out[0]["sensor"]].held_out
+    assert not SENSORS[usual[0]["sensor"]].held_out and SENSORS[held_out[0]["sensor"]].held_out
     assert [row["phase"] for row in usual] == ["before", "during", "after"]
     assert len({row["success"] for row in usual}) == 1
     assert usual[0]["contact_left"] == usual[0]["contact_right"] == 0 < usual[1]["contact_left"]
@@ -112,8 +111,7 @@ def test_outcomes_are_mixed_and_the_solver_is_stable():
             rng = np.random.default_rng([99, index, i])
             patch = skin.draw_patch(rng)
             results.append(list(bench.moments(grasps.draw_plan(bench.thing, patch, rng)))[-1])
-    assert 0.4 < np.mean([r.success for r in results]) < 0.75
-    assert np.mean([r.unstable for r in results]) < 0.02
+    assert 0.4 < np.mean([r.success for r in results]) < 0.75 and np.mean([r.unstable for r in results]) < 0.02
 
 
 def test_peaks_and_pits_differ_in_the_sign_of_their_skewness_and_nothing_else():
@@ -142,6 +140,5 @@ def test_a_lost_solver_is_a_failed_grasp_and_leaves_no_nan():
     bench = physics.Bench(thing("can"))
     bench.model.opt.gravity[2] = -1e6
     last = list(bench.moments(plan()))[-1]
-    assert last.unstable == 1
-    assert last.success == 0
+    assert last.unstable == 1 and last.success == 0
     assert np.isfinite(bench.data.qpos).all()

@@ -48,8 +48,7 @@ def test_an_item_depends_on_its_numbers_alone():
 def test_a_size_changes_the_pixels_and_not_the_scene(size):
     pair, small = touch(0, 11, 0, 0, size=size), touch(0, 11, 0, 0, size=64)
     for name in ("vision", "touch"):
-        assert pair[name].shape == (size, size, 3)
-        assert pair[name].dtype == np.uint8
+        assert pair[name].shape == (size, size, 3) and pair[name].dtype == np.uint8
         coarse = [p[name].reshape(8, p[name].shape[0] // 8, 8, -1, 3).mean((1, 3)) for p in (pair, small)]
         assert np.abs(coarse[0] - coarse[1]).mean() < 8
     assert {k: v for k, v in pair.items() if np.isscalar(v)} == {k: v for k, v in small.items() if np.isscalar(v)}
@@ -57,8 +56,7 @@ def test_a_size_changes_the_pixels_and_not_the_scene(size):
 
 def test_the_held_out_sensor_is_never_drawn_otherwise():
     seen = {touch(0, c, 0, 0, size=16)["sensor"] for c in range(len(CLASSES))}
-    assert len(seen) >= 3
-    assert all(not SENSORS[name].held_out for name in seen)
+    assert len(seen) >= 3 and all(not SENSORS[name].held_out for name in seen)
     pair = touch(0, 0, 0, 0, size=16, sensors=[SENSORS["slim"]])
     assert SENSORS[pair["sensor"]].held_out
     assert (pair["vision"] == touch(0, 0, 0, 0, size=16)["vision"]).all()
@@ -86,17 +84,14 @@ def test_labels_are_balanced_and_not_the_category_again():
     things = [[Instance(0, c, i) for i in range(60)] for c in range(len(CLASSES))]
     for label in ("soft", "rough"):
         share = np.array([[getattr(thing, label) for thing in row] for row in things]).mean(1)
-        assert 0.4 <= share.mean() <= 0.6
-        assert share.min() > 0.05
-        assert share.max() < 0.95
+        assert 0.4 <= share.mean() <= 0.6 and share.min() > 0.05 and share.max() < 0.95
         assert np.maximum(share, 1 - share).mean() <= 0.8  # who knows the class knows the label this often
 
 
 @pytest.mark.parametrize(("force", "stiffness", "dome"), [*product((0.01, 1.0, 20.0), (0.02, 1e3), (None, 20.0))])
 def test_pressure_integrates_to_the_force(force, stiffness, dome):
     p = pressure(bumps(), force_n=force, stiffness=stiffness, pixel_mm=0.2, dome_radius_mm=dome)
-    assert p.min() >= 0
-    assert p.sum(dtype=np.float64) * 0.2**2 == pytest.approx(force, rel=0.01)
+    assert p.min() >= 0 and p.sum(dtype=np.float64) * 0.2**2 == pytest.approx(force, rel=0.01)
 
 
 def test_contact_is_that_of_the_closed_form():
@@ -226,9 +221,8 @@ def test_packs_say_which_sensor_pressed():
         assert replace(plain, **options).place() != plain.place()
     two = replace(plain, makes=("mini", "digit"), sensors_per_press=2).source()
     rows = [sample.columns for item in range(4) for sample in two.read(item)]
-    assert [{row["sensor"] for row in rows if row["press"] == press} for press in {row["press"] for row in rows}] == [
-        {"mini", "digit"}
-    ] * 4
+    of_presses = [{row["sensor"] for row in rows if row["press"] == press} for press in {row["press"] for row in rows}]
+    assert of_presses == [{"mini", "digit"}] * 4
     assert len({row["id"] for row in rows}) == 8 == sum(two.samples_per_item()[:4])
     assert replace(plain, sensors=7).source().read(0)[0].columns["sensor"].startswith("random000")
 

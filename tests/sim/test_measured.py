@@ -46,10 +46,8 @@ def test_a_ball_looks_as_in_the_real_frames():
 
 
 def test_copies_differ_and_a_larger_field_than_the_gel_is_no_error():
-    blank = np.zeros((48, 48), np.float32)
-    one, same, other = (
-        render(blank, MEASURED["gelsight"], np.random.default_rng(0), pixel_mm=0.27, unit=u) for u in (1, 1, 2)
-    )
+    blank, sensor = np.zeros((48, 48), np.float32), MEASURED["gelsight"]
+    one, same, other = (render(blank, sensor, np.random.default_rng(0), pixel_mm=0.27, unit=u) for u in (1, 1, 2))
     assert (one == same).all() and np.abs(one.astype(int) - other).mean() > 2
     assert render(blank, MEASURED["gelsight_mini"], np.random.default_rng(0), pixel_mm=22 / 48, unit=1).std() > 5
 

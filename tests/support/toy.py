@@ -90,7 +90,6 @@ class Toy(Source):
         return [Sample(vision=image(self.vision_channels), touch=image(self.touch_channels), columns=columns)]
 
 
-@dataclass
 class Turned(Toy):
     """The same samples with train and test the other way round."""
 
@@ -126,7 +125,6 @@ def toy_pack(path: Path, size: int = 32, **kwargs: Any) -> Pack:
     return build(Toy(**kwargs), path, size=size, quiet=True)
 
 
-@dataclass
 class Holes(Toy):
     """Every fifth item without touch, every seventh without vision."""
 

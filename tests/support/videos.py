@@ -94,6 +94,10 @@ def shade(index: int, which: int = 0) -> int:
     return 20 + (index * 37 + which * 90) % 200
 
 
+def level(image: np.ndarray) -> float:
+    return float(image.mean())
+
+
 def film(path: Path, num: int, which: int = 0, size: tuple[int, int] = (64, 48), rate: int = 25) -> Path:
     """A video whose frame i is all of ``shade(i)``."""
     return write_video(path, num, lambda i: np.full((size[1], size[0], 3), shade(i, which), np.uint8), rate=rate)

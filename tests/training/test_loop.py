@@ -53,19 +53,17 @@ def test_leaves_the_promised_files(smoke_run: Path) -> None:
 @pytest.mark.parametrize("stop_after", [3, 7])
 def test_stopped_and_resumed_equals_straight(pack: Pack, smoke_run: Path, tmp_path: Path, stop_after: int) -> None:
     """Also across a change of epoch, with dropout, and with a checkpoint older than the stop."""
-    run = smoke(pack, checkpoint_every=2)
-    with power_cut(stop_after), pytest.raises(RuntimeError, match="power cut"):
-        train(run, tmp_path / "r", quiet=True)
+    run = cut_after(stop_after, pack, tmp_path / "r")
     train(run, tmp_path / "r", resume=True, quiet=True)
     assert_equal_weights(smoke_run, tmp_path / "r")
     steps = [json.loads(line)["step"] for line in (tmp_path / "r" / "log.jsonl").read_text().splitlines()]
     assert steps == sorted(steps) and steps.count(8) == 2  # one step line, one eval line, nothing twice
 
 
-def cut_after_five(pack: Pack, out: Path) -> Run:
-    """A run that dies after step 5, with checkpoints of steps 2 and 4."""
+def cut_after(num: int, pack: Pack, out: Path) -> Run:
+    """A run that dies after ``num`` steps, with a checkpoint of every second one."""
     run = smoke(pack, checkpoint_every=2)
-    with power_cut(5), pytest.raises(RuntimeError, match="power cut"):
+    with power_cut(num), pytest.raises(RuntimeError, match="power cut"):
         train(run, out, quiet=True)
     return run
 
@@ -84,7 +82,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(
 ) -> None:
     """One flipped bit among the weights. Once it is resumed and cut again, both are good ones."""
     out = tmp_path / "r"
-    run = cut_after_five(pack, out)
+    run = cut_after(5, pack, out)
     flip(out / CHECKPOINT)
     with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
         train(run, out, resume=True, quiet=True)
@@ -99,7 +97,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(
 
 def test_killed_between_two_checkpoints(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
     """The old one has moved away, the new one is not there yet."""
-    run = cut_after_five(pack, tmp_path / "r")
+    run = cut_after(5, pack, tmp_path / "r")
     os.replace(tmp_path / "r" / CHECKPOINT, tmp_path / "r" / PREVIOUS)
     with power_cut(4):  # steps 5 to 8 and no more
         train(run, tmp_path / "r", resume=True, quiet=True)
@@ -220,9 +218,7 @@ def test_evaluation_never_reads_test_rows(pack: Pack, smoke_run: Path, monkeypat
 
     used: list[np.ndarray] = []
     real = module.pack_features
-    monkeypatch.setattr(
-        module, "pack_features", lambda m, p, mod, rows, **k: used.append(rows) or real(m, p, mod, rows, **k)
-    )
+    monkeypatch.setattr(module, "pack_features", lambda *given, **how: used.append(given[3]) or real(*given, **how))
     validate(mvitac.load(smoke_run), pack, smoke(pack))
     assert used and not set(np.concatenate(used)) & set(pack.rows("test"))
 

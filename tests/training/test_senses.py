@@ -28,9 +28,8 @@ from support.toy import Toy
 from support.training_runs import smoke, train_twice, weights
 
 VISION = "test_resnet.r160_in1k"  # 96 features; its inputs are normalised by .5, not by ImageNet's mean and deviation
-TWO = Encoders(
-    vision=EncoderConfig(trunk=VISION, weights=SCRATCH), touch=EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)
-)
+SMALL = EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)
+TWO = Encoders(vision=EncoderConfig(trunk=VISION, weights=SCRATCH), touch=SMALL)
 SIZES = Augment(size=32, vision=ViewAugment(size=24, whole=28), touch=ViewAugment(whole=30))
 
 
@@ -98,9 +97,8 @@ def test_a_locked_trunk_sees_each_whole_image_once(
 ) -> None:
     """The run is the one whose trunk sees it at every step, to rounding, and resumes bit for bit. Probes read the same."""
     whole = ViewAugment(scale=(1.0, 1.0), flip=0.0, grayscale=0.0, size=24)
-    run = replace(
-        started(pack, file, locked=True, pool="stages"), method=small(name), augment=replace(SIZES, vision=whole)
-    )
+    run = started(pack, file, locked=True, pool="stages")
+    run = replace(run, method=small(name), augment=replace(SIZES, vision=whole))
     monkeypatch.setenv("MVITAC_CACHE", str(tmp_path))
     seen: list[str] = []
     real = features.pack_features

@@ -70,10 +70,9 @@ def test_the_first_of_equally_good_weights_is_kept(pack: Pack, tmp_path: Path, m
     kept = safetensors.torch.load_file(out / "model.best.safetensors")
     assert all(torch.equal(kept[name], value) for name, value in seen[2].items())
     assert not all(torch.equal(kept[name], value) for name, value in seen[3].items())
-    assert log_of(out)[-1]["verdict"].endswith(
-        "best at step 4 (errors -40 % in the mean over tasks, model.best.safetensors)"
-    )
-    assert "rose: touch/a +10.0 [+10.0, +10.0]" in log_of(out)[-1]["verdict"]
+    said = log_of(out)[-1]["verdict"]
+    assert said.endswith("best at step 4 (errors -40 % in the mean over tasks, model.best.safetensors)")
+    assert "rose: touch/a +10.0 [+10.0, +10.0]" in said
 
 
 def test_killed_and_resumed_keeps_the_same_best_weights_and_sentence(pack: Pack, run: Path, tmp_path: Path) -> None:

@@ -46,9 +46,8 @@ def test_both_routes_replay_the_same_parameters(size: int, channels: int) -> Non
     """Crop, flip, jitter and grayscale of the batched route are the one-by-one route's to within a level's rounding."""
     raw = images(16, channels, side=40)
     drawn = draw(ViewAugment(scale=(0.3, 1.0), grayscale=0.3, jitter=0.2), 16, 40, generator())
-    one_by_one, batched = (
-        f(raw, drawn, size, torch.float32, IMAGENET) for f in (random_views._one_by_one, random_views._batched)
-    )
+    routes = random_views._one_by_one, random_views._batched
+    one_by_one, batched = (route(raw, drawn, size, torch.float32, IMAGENET) for route in routes)
     off = 255 * (denormalise(one_by_one) - denormalise(batched)).abs()
     assert off.max() < 2.5 and off.mean() < 0.5
     wrong = Drawn(drawn.boxes.roll(1, 0), drawn.flip, drawn.grayscale, drawn.gains)
@@ -60,8 +59,7 @@ def test_both_routes_replay_the_same_parameters(size: int, channels: int) -> Non
 def test_views_are_rounded_to_bf16_once(route: Callable[..., torch.Tensor]) -> None:
     drawn = draw(ViewAugment(), 8, 40, generator())
     exact, rounded = (route(images(), drawn, 24, dtype, IMAGENET) for dtype in (torch.float32, torch.bfloat16))
-    assert torch.equal(exact.bfloat16(), rounded)
-    assert rounded.is_contiguous(memory_format=torch.channels_last)
+    assert torch.equal(exact.bfloat16(), rounded) and rounded.is_contiguous(memory_format=torch.channels_last)
 
 
 def test_flip_is_exact() -> None:

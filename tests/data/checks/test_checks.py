@@ -69,9 +69,8 @@ class Presses(Source):
         touch = gel(shown, max(0, frame - 2) if fault == "offset" else frame)
         if fault == "near-copies" and shown != obj:
             noise = np.random.default_rng(item)
-            vision, touch = (
-                np.clip(0.94 * i + 6 + noise.normal(0, 1, i.shape), 0, 255).astype(np.uint8) for i in (vision, touch)
-            )
+            copied = [0.94 * image + 6 + noise.normal(0, 1, image.shape) for image in (vision, touch)]
+            vision, touch = (np.clip(image, 0, 255).astype(np.uint8) for image in copied)
         if fault == "constant" and item % 50 == 3:
             touch = np.full_like(touch, 7)
         if (fault == "bgr" and obj in (2, 5, 8)) or (fault == "half bgr" and obj % 2):
@@ -141,14 +140,14 @@ def noisy(image: np.ndarray, seed: list[int]) -> np.ndarray:
     return made
 
 
-def check(fault: str, tmp_path: Path) -> dict[str, Finding]:
-    pack = build(Presses(fault), tmp_path / "pack", size=SIDE, max_damaged=1.0, quiet=True)
+def check(source: Presses, tmp_path: Path) -> dict[str, Finding]:
+    pack = build(source, tmp_path / "pack", size=SIDE, max_damaged=1.0, quiet=True)
     return {finding.item: finding for finding in examine(pack)}
 
 
 @pytest.mark.parametrize("kind", ["", "names of groups", "written label"])
 def test_the_healthy_one_is_healthy(kind: str, tmp_path: Path) -> None:
-    findings = check(kind, tmp_path)
+    findings = check(Presses(kind), tmp_path)
     assert {f.item: f.evidence for f in findings.values() if f.verdict != "ok"} == {}
     assert exit_code(findings.values()) == 0
     assert "best" in findings["time offset between streams"].evidence
@@ -174,11 +173,10 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_each_fault_is_named_and_nothing_else(fault: str, tmp_path: Path) -> None:
     item, verdict, evidence = FAULTS[fault]
-    findings = check(fault, tmp_path)
+    findings = check(Presses(fault), tmp_path)
     assert {f.item for f in findings.values() if f.verdict in ("look", "broken")} == {item}
     assert (findings[item].verdict, evidence in findings[item].evidence) == (verdict, True), findings[item].evidence
-    assert findings[item].advice
-    assert exit_code(findings.values()) == {"look": 1, "broken": 2}[verdict]
+    assert findings[item].advice and exit_code(findings.values()) == {"look": 1, "broken": 2}[verdict]
 
 
 def test_classes_that_differ_in_spelling_only(pack: Pack) -> None:
@@ -236,9 +234,8 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     for fault in ("", "constant", "copies"):
         path = tmp_path / f"pack {fault}"
         build(Presses(fault), path, size=SIDE, quiet=True)
-        options = ["--json", str(tmp_path / f"{fault or 'fine'}.json")]
-        options += ["--sheet", str(tmp_path / f"{fault or 'fine'}.png")]
-        codes[fault] = main(["data", "check", str(path), *options])
+        file = tmp_path / (fault or "fine")
+        codes[fault] = main(["data", "check", str(path), "--json", f"{file}.json", "--sheet", f"{file}.png"])
     assert codes == {"": 0, "constant": 1, "copies": 2}
     assert not capsys.readouterr().err
     told = json.loads((tmp_path / "constant.json").read_text())
@@ -279,7 +276,6 @@ def test_the_command_on_a_source(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_the_lag_is_touch_after_vision(late: int, tmp_path: Path) -> None:
     """Brightness jumps of the same sizes in both streams, in touch ``late`` rows after vision; the signs are random."""
 
-    @dataclass
     class Flashes(Presses):
         def read(self, item: int) -> list[Sample]:
             obj, k = divmod(item, NUM_FRAMES)
@@ -296,11 +292,9 @@ def test_the_lag_is_touch_after_vision(late: int, tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_checked_is_said_and_costs_nothing(tmp_path: Path) -> None:
-    @dataclass
     class TouchOnly(Presses):
         def spec(self) -> DataSpec:
-            spec = super().spec()
-            return DataSpec(**{**spec.__dict__, "vision_channels": 0, "touch_channels": 6})
+            return replace(super().spec(), vision_channels=0, touch_channels=6)
 
         def read(self, item: int) -> list[Sample]:
             sample = super().read(item)[0]
@@ -309,15 +303,14 @@ def test_what_cannot_be_checked_is_said_and_costs_nothing(tmp_path: Path) -> Non
             both = np.concatenate([sample.touch, sample.touch[::-1]], axis=2)
             return [Sample(vision=None, touch=both, columns=columns)]
 
-    pack = build(TouchOnly(), tmp_path / "p", size=SIDE, quiet=True)
-    findings = {f.item: f for f in examine(pack)}
+    findings = check(TouchOnly(), tmp_path)
     cannot = {item for item, f in findings.items() if f.verdict == "not checkable"}
     assert cannot == {"time offset between streams"}
     assert "touch 2: all in one order" in findings["red and blue swapped"].evidence
     assert exit_code(findings.values()) == 0
 
 
-def test_missing_images_are_no_faults_of_the_others(tmp_path: Path) -> None:
+def test_missing_images_are_no_faults_of_the_others() -> None:
     """A third of the rows without vision: no constant frames, no copies; only a split without any is worth a look."""
 
     class Gaps(Presses):
@@ -340,7 +333,6 @@ def test_a_task_is_judged_by_its_own_split(tmp_path: Path) -> None:
     """As Touch and Go's rough/smooth: its lists divide recordings otherwise than those of the categories, and of those
     that they divide they may leave frames out."""
 
-    @dataclass
     class Otherwise(Presses):
         def spec(self) -> DataSpec:
             spec = super().spec()
@@ -356,7 +348,7 @@ def test_a_task_is_judged_by_its_own_split(tmp_path: Path) -> None:
                 own = {"label_rough": -1, "split_rough": "test"}
             return [replace(sample, columns={**sample.columns, **own})]
 
-    findings = {f.item: f for f in examine(build(Otherwise(), tmp_path / "p", size=SIDE, quiet=True))}
+    findings = check(Otherwise(), tmp_path)
     assert "always saying 'smooth' scores 50.0 % on test" in findings["labels of rough"].evidence
     assert "; 11 of " in findings["labels of rough"].evidence and "first 09-09" in findings["labels of rough"].evidence
     assert {f.item for f in findings.values() if f.verdict in ("look", "broken")} == {"labels of rough"}
@@ -364,7 +356,6 @@ def test_a_task_is_judged_by_its_own_split(tmp_path: Path) -> None:
 
 
 def test_what_was_not_compared_is_not_called_well(tmp_path: Path) -> None:
-    @dataclass
     class Untested(Presses):
         def read(self, item: int) -> list[Sample]:
             sample = super().read(item)[0]
@@ -373,7 +364,7 @@ def test_what_was_not_compared_is_not_called_well(tmp_path: Path) -> None:
             vision[:4], touch[:4] = 0, 0
             return [Sample(vision=vision, touch=touch, columns={**sample.columns, "split": "train"})]
 
-    findings = {f.item: f for f in examine(build(Untested(), tmp_path / "p", size=SIDE, quiet=True))}
+    findings = check(Untested(), tmp_path)
     near, colour = findings["near-copies across splits"], findings["red and blue swapped"]
     assert (near.verdict, near.evidence) == ("not checkable", "vision: all in one split; touch: all in one split")
     assert colour.verdict == "not checkable" and "colours vary too much to tell" in colour.evidence
@@ -382,15 +373,13 @@ def test_what_was_not_compared_is_not_called_well(tmp_path: Path) -> None:
 def test_other_keys_are_looked_at_too(tmp_path: Path) -> None:
     """Touch and Go's own split: touches are apart, recordings are not."""
 
-    @dataclass
     class Recorded(Presses):
         def read(self, item: int) -> list[Sample]:
             sample = super().read(item)[0]
             day = {"recording": f"day {item // NUM_FRAMES // 5}"}
             return [Sample(vision=sample.vision, touch=sample.touch, columns={**sample.columns, **day})]
 
-    pack = build(Recorded(), tmp_path / "p", size=SIDE, quiet=True)
-    own = next(f for f in examine(pack) if f.item == "groups across splits")
+    own = check(Recorded(), tmp_path)["groups across splits"]
     assert own.verdict == "look" and "recording: 4 of 4 in more than one split" in own.evidence
     assert "4 of 4 in test are also in train" in own.evidence
 
