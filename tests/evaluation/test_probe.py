@@ -26,6 +26,7 @@ from mvitac.evaluation.classifiers import fit_knn, fit_linear, fit_papers
 from mvitac.evaluation.controls import borders, controls_of, frozen_trunks, imagenet_trunk, starts_of, thumbnails
 from mvitac.evaluation.diagnostics import linear_probe
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.features import _folded
 from mvitac.evaluation.few_labels import few
 from mvitac.evaluation.folds import fold_splits
 from mvitac.evaluation.leaks import read_sources
@@ -35,7 +36,7 @@ from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.run_names import names_of
 from mvitac.evaluation.score_text import verdicts
 from mvitac.methods.supervised import SupervisedConfig
-from mvitac.model import fresh, load
+from mvitac.model import Model, fresh, load
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders
 from mvitac.recipes import recipe, with_method
 from mvitac.report.report import open_runs
@@ -210,6 +211,24 @@ def test_damaged_cached_features_are_computed_again(
     file.write_bytes({"bit": bytes(bit), "cut": whole[:500], "no digest": whole[:-32]}[damage])
     np.testing.assert_array_equal(features_module.features(model, pack, "touch", rows), first)
     assert file.read_bytes() == whole
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_a_folded_network_is_used_only_where_it_is_the_same(
+    smoke_run: Path, pack: Pack, monkeypatch: pytest.MonkeyPatch, same: bool
+) -> None:
+    model, rows = load(smoke_run), np.arange(300) % pack.num
+    made, kept = _folded(model, "touch"), {name: id(module) for name, module in model.named_modules()}
+    if not same:
+        made.encoders["touch"].conv1[0].weight.data *= 2
+    monkeypatch.setattr("mvitac.evaluation.features._folded", lambda *_: made)
+    read, whole = [], Model.features
+    monkeypatch.setattr(
+        Model, "features", lambda self, *args, **more: (read.append(self), whole(self, *args, **more))[1]
+    )
+    found = features_module.pack_features(model, pack, "touch", rows)
+    assert read[:3] == [model, made, made if same else model] and kept == {n: id(m) for n, m in model.named_modules()}
+    torch.testing.assert_close(found[:50], features_module.pack_features(model, pack, "touch", rows[:50]))
 
 
 def test_retrieval_of_the_untrained_is_chance(pack: Pack) -> None:

@@ -12,6 +12,7 @@ from timm.models.vision_transformer import VisionTransformer
 from torch import nn
 
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, build_trunk, sin_cos_positions
+from mvitac.nn.folded import folded
 from mvitac.nn.losses import info_nce
 from mvitac.nn.small_conv import SmallMapConv2d, _Product, use_convolutions, use_products
 from mvitac.nn.vit import encode_visible, patches, row_uniform
@@ -33,11 +34,23 @@ def test_is_fp32_under_autocast() -> None:
     assert inside.dtype == torch.float32 and float(inside) == float(info_nce(q.float(), k.float(), 0.07))
 
 
+@pytest.mark.parametrize(("name", "left"), [("tf_efficientnet_lite0", 0), ("resnet10t", 1)])
+def test_folded_batch_norm_changes_nothing(name: str, left: int) -> None:
+    """That after a ResNet's stem of several convolutions is not beside the last of them."""
+    trunk = build_trunk(EncoderConfig(trunk=name, weights=SCRATCH, pool="stages"), 3)
+    trunk(torch.randn(4, 3, 64, 64))  # statistics
+    images, before = torch.randn(2, 3, 64, 64), copy.deepcopy(trunk.eval().state_dict())
+    got = folded(trunk)
+    torch.testing.assert_close(got(images), trunk(images))
+    assert sum(isinstance(module, nn.BatchNorm2d) for module in got.modules()) == left
+    assert all(torch.equal(before[name], value) for name, value in trunk.state_dict().items())
+
+
 @pytest.mark.parametrize("stride", [1, 2])
 @pytest.mark.parametrize(
     ("kind", "kernel"), [("Product", 3), ("Depthwise", 3), ("Depthwise", 5), ("DepthwiseSame", 3), ("DepthwiseSame", 5)]
 )
-@pytest.mark.parametrize("side", [(1, 1), (2, 2), (3, 1), (3, 4), (7, 8)])
+@pytest.mark.parametrize("side", [(1, 1), (2, 2), (3, 1), (3, 4), (6, 8), (7, 8)])
 def test_equals_the_convolution_and_its_gradients(
     side: tuple[int, int], kind: str, kernel: int, stride: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -52,6 +65,7 @@ def test_equals_the_convolution_and_its_gradients(
     got, want = ours(images), theirs(images)
     assert kind.removesuffix("Same") in type(got.grad_fn).__name__
     torch.testing.assert_close(got, want)
+    torch.testing.assert_close(ours.eval()(images), want)
     towards = torch.randn_like(want)
     mine = torch.autograd.grad(got, (images, *ours.parameters()), towards)
     torch.testing.assert_close(mine, torch.autograd.grad(want, (images, *theirs.parameters()), towards))

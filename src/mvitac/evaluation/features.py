@@ -1,5 +1,6 @@
 """Features of a pack's rows from a frozen model, kept in a cache on disk."""
 
+import copy
 import hashlib
 import io
 from collections.abc import Callable, Sequence
@@ -7,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import MODALITIES
 from mvitac.model import Model
+from mvitac.nn.folded import folded
 from mvitac.system.files import cache_dir, digest, write_atomic
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.progress import work
@@ -91,9 +93,24 @@ def pack_features(
     if device.type == "cpu":
         keep_freed_memory()  # else every activation is mapped again: over twice the time on a virtual machine
     size = 64 if device.type == "cpu" else 256  # more leave the cache: with 256, EfficientNet takes 1.5 times as long
+
+    def read(model: Model, rows: np.ndarray) -> Tensor:
+        images = torch.from_numpy(pack.images[modality][rows]).permute(0, 3, 1, 2).to(device)
+        return model.features(modality, images, for_heads=for_heads, bf16=bf16).detach().cpu()
+
+    if device.type == "cpu" and not bf16 and len(rows) > 4 * size:
+        expected, faster = read(model, rows[:2]), _folded(model, modality)
+        if (read(faster, rows[:2]) - expected).abs().max() <= 1e-4 * expected.abs().max():
+            model = faster
     chunks = []
     for chunk in np.array_split(rows, max(1, len(rows) // size)):
-        images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
-        chunks.append(model.features(modality, images, for_heads=for_heads, bf16=bf16).detach().cpu())
+        chunks.append(read(model, chunk))
         advance(len(chunk))
     return torch.cat(chunks)
+
+
+def _folded(model: Model, modality: str) -> Model:
+    """``model`` with another encoder of ``modality``: ``folded``."""
+    encoders, made = {**model.encoders, modality: folded(model.encoders[modality])}, copy.copy(model)
+    made._modules = {**model._modules, "encoders": nn.ModuleDict(encoders)}
+    return made

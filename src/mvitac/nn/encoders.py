@@ -38,6 +38,17 @@ def mvitac_tiny(pretrained: bool = False, **kwargs: Any) -> ResNet:
 
 
 @register_model
+def mvitac_resnet8(pretrained: bool = False, **kwargs: Any) -> ResNet:
+    """timm's ResNet-10-T without its last stage, for images of some 48 px (256 features, 1.2 M parameters)."""
+    _from_scratch("mvitac_resnet8", pretrained, kwargs)
+    shape: dict[str, Any] = {"stem_width": 32, "stem_type": "deep_tiered", "avg_down": True}
+    trunk = ResNet(BasicBlock, (1, 1, 1, 1), **shape, **kwargs)
+    trunk.layer4, trunk.num_features, trunk.head_hidden_size = nn.Identity(), 256, 256  # type: ignore[assignment]
+    del trunk.feature_info[-1]
+    return trunk
+
+
+@register_model
 def mvitac_vit(pretrained: bool = False, **kwargs: Any) -> VisionTransformer:
     """A ViT for CPUs and small images: 192 features, 6 blocks, patches of 8 px (2.7 M parameters)."""
     return _small_vit("mvitac_vit", pretrained, {"embed_dim": 192, "depth": 6, "num_heads": 3}, kwargs)
@@ -201,8 +212,10 @@ class Stages(nn.Module):
         self.num_features = sum(stage["num_chs"] for stage in trunk.feature_info)  # type: ignore[union-attr]
 
     def forward(self, images: Tensor) -> Tensor:
-        maps = self.trunk.forward_intermediates(images, intermediates_only=True)  # type: ignore[operator]
-        return torch.cat([each.mean((2, 3)) for each in maps], 1)
+        each = [*range(len(self.trunk.feature_info))]  # type: ignore[arg-type]
+        maps = self.trunk.forward_intermediates(images, each, intermediates_only=True)  # type: ignore[operator]
+        # In the order in which they lie in memory: else their gradients have another one, and are copied.
+        return torch.cat([each.permute(0, 2, 3, 1).flatten(1, 2).mean(1) for each in maps], 1)
 
 
 def within(trunk: nn.Module) -> nn.Module:

@@ -15,6 +15,7 @@ from functools import lru_cache
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from timm.layers.conv2d_same import Conv2dSame
 from timm.layers.padding import pad_same
 from torch import Tensor, nn
@@ -51,9 +52,13 @@ class DepthwiseConv2dSame(Conv2dSame):
     """The same for timm's convolution that pads as TensorFlow does."""
 
     def forward(self, input: Tensor) -> Tensor:
-        if not _pays(self, input):
+        if _pays(self, input):
+            return _depthwise(self, pad_same(input, self.kernel_size, self.stride), 0)  # type: ignore[arg-type]
+        if torch.compiler.is_compiling() or self.stride != (2, 2) or any(side % 2 for side in input.shape[-2:]):
             return super().forward(input)
-        return _depthwise(self, pad_same(input, self.kernel_size, self.stride), 0)  # type: ignore[arg-type]
+        # One more pixel right and below: a kernel with a row and a column of zeros needs no copy of the map.
+        kernel = F.pad(self.weight, (1, 0, 1, 0))
+        return torch.conv2d(input, kernel, self.bias, 2, self.kernel_size[0] // 2, 1, self.groups)
 
 
 def _pays(conv: Any, input: Tensor) -> bool:
