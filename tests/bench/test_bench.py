@@ -292,6 +292,8 @@ FORGED: dict[str, tuple[Change, str]] = {
     "field": (put("mine", value=1), "has the unknown field 'mine'"),
     "field about": (put("about", "mine", value=1), "has the unknown field 'mine'"),
     "field of a block": (put("blocks", 0, "mine", value=1), "has the unknown field 'mine'"),
+    "field of the encoder": (put("encoder", "mine", value=1), "has the unknown field 'mine'"),
+    "clipped": (put(*VALUES, "clipped", value=[9, 4]), "9 of its 4 features were clipped"),
     "excuse": (put("blocks", 0, "left_out", value={"vision": NO_VISION}), NO_VISION),
     "nothing": (lambda value: [not_run(block) for block in value["blocks"]], "was run on no task"),
     "twice": (put(*RECORDS, value=lambda records: [*records, records[0]]), "is there twice"),

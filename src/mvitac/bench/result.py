@@ -37,6 +37,8 @@ COUNTS = ("n", "correct")  # sums per group of classes: rows, and those that are
 ABOUT_ROWS = ("n", "value", "squared_value")  # sums that depend on the rows alone
 FIELDS = ("format", "format_version", "suite", "suite_digest", "encoder", "versions", "blocks", *VOLATILE)
 ABOUT = ("python", "machine", "commit", "time", "seconds")
+ENCODER = ("external", "method", "features", "licence", "trained_on", "images_seen", "size", "parameters")
+ENCODER = ("name", "seeds", "weights", *ENCODER)
 BLOCK = ("set", "task", "not_run", "form", "data", "group_by", "groups", "leaks", "left_out", "records", "notes")
 GUESS = "majority or mean"  # what the page calls these two controls
 MAX_NAME = 200
@@ -145,7 +147,8 @@ def problems(value: dict[str, Any]) -> list[str]:
     """What is missing in a result, or cannot be, in one line each: tasks, scores, controls, sums, data."""
     suite, encoder = suite_of(value), value["encoder"]
     found = list(problems_of(encoder, (*CONTROLS, GUESS)))
-    parts = [(value, FIELDS), (value.get("about", {}), ABOUT), *((block, BLOCK) for block in value["blocks"])]
+    parts = [(value, FIELDS), (value.get("about", {}), ABOUT), (encoder, ENCODER)]
+    parts += [(block, BLOCK) for block in value["blocks"]]
     for fields, known in parts:
         found += [f"has the unknown field {name!r}" for name in sorted(fields.keys() - {*known})]
     asked = [(one, ask) for one in suite.sets for ask in one.tasks]
@@ -247,6 +250,9 @@ def _impossible(record: dict[str, Any], num_groups: int) -> str:
     names = SUMS if "targets" in record else COUNTS
     if {*record["sums"]} != {*names} or {*record} - {*KEY, "clipped", "targets", "sums"}:
         return f"its fields are {sorted(record)}, its sums {sorted(record['sums'])}"
+    clipped, of = record.get("clipped", (0, 0))
+    if not 0 <= clipped <= of:
+        return f"{clipped} of its {of} features were clipped"
     try:
         sums = {name: np.array(record["sums"][name], float) for name in names}
         kinds = {np.array(values).dtype.kind for values in record["sums"].values()}
