@@ -103,7 +103,12 @@ def from_json(annotation: Any, value: Any, where: str = "run") -> Any:
             raise unknown(f"value of {where}", str(value), [str(a) for a in arguments])
         return value
     if origin is tuple:
-        return _tuple_from_json(arguments, value, where)
+        if not isinstance(value, list):
+            raise ValueError(f"{where}: expected a list, got {value!r}")
+        each = [arguments[0]] * len(value) if len(arguments) == 2 and arguments[1] is Ellipsis else arguments
+        if len(each) != len(value):
+            raise ValueError(f"{where}: expected {len(each)} values, got {value!r}")
+        return tuple(from_json(a, v, where) for a, v in zip(each, value, strict=True))
     nested = isinstance(annotation, type) and dataclasses.is_dataclass(annotation)
     if (origin is dict or nested) and not isinstance(value, dict):
         raise ValueError(f"{where}: expected an object, got {value!r}")
@@ -112,15 +117,6 @@ def from_json(annotation: Any, value: Any, where: str = "run") -> Any:
     if nested:
         return _dataclass_from_json(annotation, dict(value), where)
     return _scalar_from_json(annotation, value, where)
-
-
-def _tuple_from_json(types_: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
-    if not isinstance(value, list):
-        raise ValueError(f"{where}: expected a list, got {value!r}")
-    each = [types_[0]] * len(value) if len(types_) == 2 and types_[1] is Ellipsis else types_
-    if len(each) != len(value):
-        raise ValueError(f"{where}: expected {len(each)} values, got {value!r}")
-    return tuple(from_json(a, v, where) for a, v in zip(each, value, strict=True))
 
 
 def _dataclass_from_json(cls: type, given: dict[str, Any], where: str) -> Any:

@@ -156,23 +156,22 @@ class Run:
             given = f"steps {self.steps}" if self.steps else f"epochs {self.epochs}"
             raise ValueError(f"{given}: too many to finish on any machine, give at most {MAX_STEPS} steps in all")
         for modality in spec.modalities:
-            self._check_encoder(modality, spec, stored_size)
+            encoder, size = self.encoder[modality], self.augment.size_of(modality)
+            # Whole images may be enlarged: a network that learned on large ones sees more in them (docs/start.md).
+            if size > stored_size and not self.augment.of(modality).fixed:
+                what = f"{modality} of {size} px cannot be cut from images stored at {stored_size} px"
+                raise ValueError(f"{what}: give --augment.size {stored_size} or less, or pack at a larger --data.size")
+            if encoder.temporal != "stack" and spec.window.frames == 1:
+                what = f"encoder.{modality}.temporal {encoder.temporal} has no effect on single images"
+                raise ValueError(f"{what}: give --data.num-frames 2 or more, or leave it out")
+            taken = self.init and modality in (self.init.modalities or spec.modalities)
+            if encoder.locked and encoder.weights == SCRATCH and not taken:
+                raise ValueError(
+                    f"{modality} is locked at random weights: give --encoder.{modality}.weights, or --init"
+                )
+            self.method.check_encoder(encoder, size)
         if self.precision == "bf16" and self.device.startswith("mps"):
             raise ValueError("bf16 is not supported on mps: use --precision fp32")
-
-    def _check_encoder(self, modality: str, spec: DataSpec, stored_size: int) -> None:
-        encoder, size = self.encoder[modality], self.augment.size_of(modality)
-        # Whole images may be enlarged: a network that learned on large ones sees more in them (docs/start.md).
-        if size > stored_size and not self.augment.of(modality).fixed:
-            what = f"{modality} of {size} px cannot be cut from images stored at {stored_size} px"
-            raise ValueError(f"{what}: give --augment.size {stored_size} or less, or pack at a larger --data.size")
-        if encoder.temporal != "stack" and spec.window.frames == 1:
-            what = f"encoder.{modality}.temporal {encoder.temporal} has no effect on single images"
-            raise ValueError(f"{what}: give --data.num-frames 2 or more, or leave it out")
-        taken = self.init and modality in (self.init.modalities or spec.modalities)
-        if encoder.locked and encoder.weights == SCRATCH and not taken:
-            raise ValueError(f"{modality} is locked at random weights: give --encoder.{modality}.weights, or --init")
-        self.method.check_encoder(encoder, size)
 
     @property
     def bf16(self) -> bool:

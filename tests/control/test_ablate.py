@@ -134,7 +134,7 @@ def test_numbers_that_would_be_wrong(pack: Pack) -> None:
     assert result["rows"][0]["change"][0] > 0.1
 
 
-@pytest.mark.parametrize("cells", [["False", "True"], [False, True], [0, 1], [0.0, 1.0]])
+@pytest.mark.parametrize("cells", [["False", "True"], [False, True], [0, 1], [0.0, 1.0], ["no", "Yes"]])
 def test_contact_is_the_column_where_there_is_one(pack: Pack, cells: list[Any]) -> None:
     made = copy.copy(pack)
     asked = np.arange(pack.num) % 3 > 0
@@ -143,8 +143,27 @@ def test_contact_is_the_column_where_there_is_one(pack: Pack, cells: list[Any]) 
     assert not np.array_equal(read_episodes(pack).touched, asked)
 
 
+def test_an_episode_is_one_recording_of_a_group(pack: Pack) -> None:
+    made = copy.copy(pack)
+    column = made.table.column_names.index("group")
+    made.table = pack.table.set_column(column, "group", pa.array(["one object"] * pack.num))
+    for own, theirs in zip(read_episodes(made).rows, read_episodes(pack).rows, strict=True):
+        assert np.array_equal(own, theirs)
+    column = made.table.column_names.index("frame")
+    made.table = made.table.set_column(column, "frame", pa.array(np.arange(pack.num) // 2))
+    with pytest.raises(
+        ValueError, match=r"8 episodes have two rows with the same frame, the first at row \d+: pack with"
+    ):
+        read_episodes(made)
+
+
 def test_episodes_that_say_nothing(pack: Pack) -> None:
     """Touch that is not there is black, and actions that never change have no scale: both were "does not use touch"."""
+    for word in ("maybe", "nan"):
+        made = copy.copy(pack)
+        made.table = pack.table.append_column("contact", pa.array(["no"] * (pack.num - 1) + [word]))
+        with pytest.raises(ValueError, match=f"column contact has '{word}': give yes or no"):
+            read_episodes(made)
     made = copy.copy(pack)
     made.table = pack.table.append_column("has_touch", pa.array(np.arange(pack.num) > 4))
     with pytest.raises(ValueError, match="5 rows have no touch"):

@@ -245,6 +245,27 @@ def test_a_replay_buffer_in_zarr(tmp_path: Path, kind: str) -> None:
             config.source()
 
 
+@pytest.mark.parametrize("kind", ["zarr", "hdf5", "never written"])
+def test_parts_that_are_not_there_are_noted(tmp_path: Path, kind: str) -> None:
+    """An incomplete copy of a zarr, and HDF5 datasets that nobody filled, read as zeros."""
+    path = tmp_path / ("a.zarr" if kind == "zarr" else "a.h5")
+    create = "create_array" if kind == "zarr" else "create_dataset"
+    with nullcontext(zarr.open_group(path, mode="w")) if kind == "zarr" else h5py.File(path, "w") as file:
+        more = {"chunks": (5, 24, 32, 3)} if kind == "zarr" else {}
+        for name, level in (("camera", 0), ("gel", 100)):
+            data = grays(*range(level + 1, level + 21))
+            made: Any = getattr(file, create)(name, shape=data.shape, dtype=data.dtype, **more)
+            made[:] = data
+        chunks = {} if kind == "never written" else {"chunks": (5,)}
+        force: Any = getattr(file, create)("force_n", shape=(20,), dtype="f4", **chunks)
+        if kind != "never written":
+            force[:10] = force[15:] = 1.0
+    config = FolderConfig(path=path, vision="camera", touch=("gel",))
+    num = 1 if kind == "never written" else 4
+    note = f"{path.name}: 1 of {num} chunks of /force_n are not there and read as its fill value"
+    assert config.source().spec().notes[0] == note
+
+
 @pytest.mark.parametrize("kind", ["list", "padded", "opaque"])
 def test_jpegs_in_hdf5(tmp_path: Path, kind: str) -> None:
     """As lists of bytes, as rows that end in zeros (ALOHA) and as opaque bytes; and blue first, as OpenCV writes RGB."""

@@ -74,11 +74,16 @@ def measure(
     encoder = describe(models, places, about)
     path = out / f"{slug(suite.name + '-' + encoder['name'])}.json"
     check_place(path)
-    if path.exists() and (old := read_signed(path, form)["encoder"]["weights"]) != encoder["weights"]:
-        raise ValueError(f"{path} is the result of other weights ({old[0][:12]}): give --name, or another --out")
+    old: dict[str, Any] = read_signed(path, form) if path.exists() else {"encoder": encoder}
+    if (of := old["encoder"]["weights"]) != encoder["weights"]:
+        raise ValueError(f"{path} is the result of other weights ({of[0][:12]}): give --name, or another --out")
     start = time.perf_counter()
     with hold_lock(path, f"another process writes {path}: wait for it, or give another --out", wait=False):
         found = score(models, encoder)
+        was = {(b["set"], b["task"]): b["data"] for b in old.get("blocks", ()) if "data" in b}
+        for b in found.get("blocks", ()):
+            if "data" in b and was.get((b["set"], b["task"]), b["data"]) != b["data"]:
+                raise ValueError(f"{path} is the result on other data of {b['set']}: move it, or give another --out")
         now = {"time": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": round(time.perf_counter() - start)}
         write_result(path, sign(form, suite, encoder, found, {**provenance(), **now}))
         for part in (out / "parts").glob(f"{digest(encoder)[:16]}-*.json"):

@@ -39,7 +39,9 @@ FIELDS = ("format", "format_version", "suite", "suite_digest", "encoder", "versi
 ABOUT = ("python", "machine", "commit", "time", "seconds")
 ENCODER = ("external", "method", "features", "licence", "trained_on", "images_seen", "size", "parameters")
 ENCODER = ("name", "seeds", "weights", *ENCODER)
+EXTERNAL = ("encoder", "title", "seed", "weights", "notes", "encoders")
 BLOCK = ("set", "task", "not_run", "form", "data", "group_by", "groups", "leaks", "left_out", "records", "notes")
+NO_IMAGENET = "without the control imagenet"  # a note
 GUESS = "majority or mean"  # what the page calls these two controls
 MAX_NAME = 200
 
@@ -148,15 +150,15 @@ def problems(value: dict[str, Any]) -> list[str]:
     suite, encoder = suite_of(value), value["encoder"]
     found = list(problems_of(encoder, (*CONTROLS, GUESS)))
     parts = [(value, FIELDS), (value.get("about", {}), ABOUT), (encoder, ENCODER)]
+    parts.append((encoder.get("external", {}), EXTERNAL))
     parts += [(block, BLOCK) for block in value["blocks"]]
     for fields, known in parts:
         found += [f"has the unknown field {name!r}" for name in sorted(fields.keys() - {*known})]
     asked = [(one, ask) for one in suite.sets for ask in one.tasks]
     if (want := [(s.name, t.name) for s, t in asked]) != (have := [(b["set"], b["task"]) for b in value["blocks"]]):
         return [*found, f"has the tasks {have}, the suite asks for {want}"]
-    trunks = {any(r["source"] == "imagenet" for r in b["records"]) for b in value["blocks"] if "records" in b}
-    if len(trunks) != 1:
-        found.append("has the control imagenet in some tasks only" if trunks else "was run on no task")
+    if all("not_run" in block for block in value["blocks"]):
+        found.append("was run on no task")
     data: dict[str, Any] = {}
     for block, (one, ask) in zip(value["blocks"], asked, strict=True):
         if "data" in block and data.setdefault(one.name, block["data"]) != block["data"]:
@@ -237,7 +239,7 @@ def _expected(suite: Suite, ask: SuiteTask, block: dict[str, Any], seeds: Sequen
     read = [m for m in ask.modalities if m not in block["left_out"]]
     found: set[Key] = {("", m, kind, seed) for m in read for kind in probes for seed in seeds}
     trunks: list[tuple[str, int | None]] = [("untrained", parse(text).seed) for text in suite.untrained]
-    if any(record["source"] == "imagenet" for record in block["records"]):
+    if NO_IMAGENET not in block.get("notes", ()):
         trunks.append(("imagenet", None))
     found |= {(name, m, kind, seed) for m in ask.modalities for kind in ("linear", *few) for name, seed in trunks}
     found |= {("pixels", m, "linear", None) for m in ask.modalities}
@@ -256,9 +258,10 @@ def _impossible(record: dict[str, Any], num_groups: int) -> str:
     try:
         sums = {name: np.array(record["sums"][name], float) for name in names}
         kinds = {np.array(values).dtype.kind for values in record["sums"].values()}
+        truths = any(isinstance(x, bool) for part in record["sums"].values() for x in np.array(part, object).flat)
     except (TypeError, ValueError):
         return "its sums are no numbers"
-    if kinds - {*"iuf"}:
+    if truths or kinds - {*"iuf"}:
         return "its sums are no numbers"
     n = sums["n"] = np.atleast_2d(sums["n"])
     if any(np.atleast_2d(each).shape != n.shape for each in sums.values()) or n.shape[1] > num_groups:
@@ -275,6 +278,8 @@ def _impossible(record: dict[str, Any], num_groups: int) -> str:
     if (n.sum(1) == 0).any():
         return "it has no rows"
     if "targets" not in record:
+        if record["source"] == "majority" and (sums["correct"] >= n).all():
+            return "one answer is right for all rows"
         return "it has more correct rows than rows" if (sums["correct"] > n).any() else ""
     least = 1 - 1e-6  # sums have ten digits
     low, high = sums["error"] ** 2 / np.maximum(n, 1), sums["error"] ** 2

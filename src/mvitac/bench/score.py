@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mvitac.bench.external import ExternalModel, open_model
-from mvitac.bench.result import stored
+from mvitac.bench.result import NO_IMAGENET, stored
 from mvitac.bench.suite import Opened, Suite, SuiteSet, SuiteTask, open_set
 from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Images, Pack
@@ -148,7 +148,7 @@ def score_suite(entry: Entry, suite: Suite, root: Path | None, parts: Path, key:
     encoder.
     """
     here = provenance()
-    beside = trunks(suite)
+    beside, lacking = trunks(suite)
     weights = [model.weights_digest() for _, model in beside]
     with work(f"{entry.name} on {suite.name}", sum(len(one.tasks) for one in suite.sets), "tasks") as advance:
         for one in suite.sets:
@@ -166,18 +166,18 @@ def score_suite(entry: Entry, suite: Suite, root: Path | None, parts: Path, key:
                 controls = kept_part(parts, "controls", known, lambda r=readers, a=about_all: _controls(r, *a))
                 scored = kept_part(parts, key, about, lambda r=own, a=about_all: _scores(r, *a))
                 block = _block(entry, one, opened, ask, task, scored, controls)
-                yield {**block, "notes": own[0].notes} if scored else block
+                yield {**block, "notes": [*own[0].notes, *lacking]} if scored else block
                 advance()
 
 
-def trunks(suite: Any) -> list[tuple[str, ExternalModel]]:
-    """The controls that are networks, by name; that of ImageNet only where its weights can be had."""
+def trunks(suite: Any) -> tuple[list[tuple[str, ExternalModel]], list[str]]:
+    """The controls that are networks, by name, and a note on that of ImageNet where its weights cannot be had."""
     found = [("untrained", open_model(text)) for text in suite.untrained]
     try:
-        return [*found, ("imagenet", open_model(suite.imagenet))]
+        return [*found, ("imagenet", open_model(suite.imagenet))], []
     except ValueError as error:
-        print(f"mvitac: without the control imagenet: {error}", file=sys.stderr)
-        return found
+        print(f"mvitac: {NO_IMAGENET}: {error}", file=sys.stderr)
+        return found, [NO_IMAGENET]
 
 
 def _scores(readers: Sequence[Reader], opened: Opened, suite: Suite, ask: SuiteTask, task: AnyTask) -> Records:

@@ -216,18 +216,14 @@ def _fold(pack: Pack, one: SuiteSet) -> tuple[Pack, ...]:
     kept = sorted(set(groups[answered].tolist()))
     if one.folds > len(kept):
         raise ValueError(f"{one.name} has {len(kept)} labelled groups, the suite asks for {one.folds} folds")
-    strata = [_stratum(pack, tasks[one.tasks[0].name], groups == group) for group in kept]
+    first, strata = tasks[one.tasks[0].name], [""] * len(kept)
+    if isinstance(first, Task):  # folds have an equal share of groups with each mean label; of values, of all groups
+        labels = [own[own >= 0] for own in (pack.labels(first.name)[groups == group] for group in kept)]
+        strata = [f"{known.mean():.2f}" if len(known) else "" for known in labels]
     columns = folds(kept, strata, one.folds, one.val_every)
     sides = [dict(zip(kept, column, strict=True)) for column in columns.values()]
     splits = ([side.get(group, "unlabelled") for group in groups.tolist()] for side in sides)
     return tuple(pack.with_splits({"split": split}) for split in splits)
-
-
-def _stratum(pack: Pack, task: AnyTask, rows: np.ndarray) -> str:
-    """What folds have an equal share of: groups with this mean label. Of values: all groups."""
-    labels = pack.labels(task.name)[rows] if isinstance(task, Task) else np.zeros(0)
-    known = labels[labels >= 0]
-    return f"{known.mean():.2f}" if len(known) else ""
 
 
 def _rows_digest(packs: Sequence[Pack], tasks: Sequence[AnyTask]) -> str:

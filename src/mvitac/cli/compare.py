@@ -78,7 +78,10 @@ def compare(argv: list[str]) -> None:
     chosen, rest = selectors(argv, ("--plan", "--data", "--recipe"))
     plan = find_plan(chosen.get("--plan", "table1"))
     options = _parse(chosen, rest, plan)
-    plan = _changed(plan, chosen.get("--recipe", plan.recipe), options)
+    same = {name: getattr(options, name) for name in ("data", *_SAME)}
+    changes = {**plan.set, **dict(setting(text) for text in options.set)}
+    recipe = chosen.get("--recipe", plan.recipe)
+    plan = replace(plan.only(options.rows), recipe=recipe, set=changes, **same)
     config = ProbeConfig(probes=plan.probes, tasks=plan.tasks, modalities=plan.modalities)
     if not options.dry_run:
         check_place(options.out / "plan.json")
@@ -108,9 +111,3 @@ def _parse(chosen: dict[str, str], rest: list[str], plan: Plan) -> _Options:
     options = parse(_Options, rest, "compare", default=usual, description=manual)
     pick_device(options.device)
     return options
-
-
-def _changed(plan: Plan, recipe: str, options: _Options) -> Plan:
-    same = {name: getattr(options, name) for name in ("data", *_SAME)}
-    changes = {**plan.set, **dict(setting(text) for text in options.set)}
-    return replace(plan.only(options.rows), recipe=recipe, set=changes, **same)

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from tyro.conf import Positional
 
@@ -78,11 +77,6 @@ def export(argv: list[str]) -> None:
     with shown():
         new = Pack(options.new_sensor) if options.new_sensor else None
         report = export(with_probes(model, pack), pack, options.out, options, new=new)
-    title = f"{options.out}: checked on {report['num_rows']} rows of {(new or pack).path}"
-    print(text_table(title, ["", "original", "export"], _rows(report)))
-
-
-def _rows(report: dict[str, Any]) -> list[list[str]]:
     both = ("original", "export")
     rows = [[f"{t}, accuracy %", *(f"{v[k]:.1f}" for k in both)] for t, v in report["accuracy"].items()]
     for target in (target for targets in report["values"].values() for target in targets):
@@ -92,4 +86,6 @@ def _rows(report: dict[str, Any]) -> list[list[str]]:
         rows.append([f"{target['name']}, change, {target['unit']}", "", f"{target['change']:.2g}"])
     rows += [[f"{name}, lowest cosine", "", f"{values['min']:.5f}"] for name, values in report["cosine"].items()]
     latency = "{p50} / {p99}".format(**report["latency_ms"])
-    return [*rows, ["size, MB", "", f"{report['size_mb']}"], ["latency of one pair, ms: p50 / p99", "", latency]]
+    rows += [["size, MB", "", f"{report['size_mb']}"], ["latency of one pair, ms: p50 / p99", "", latency]]
+    title = f"{options.out}: checked on {report['num_rows']} rows of {(new or pack).path}"
+    print(text_table(title, ["", *both], rows))

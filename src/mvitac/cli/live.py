@@ -83,7 +83,13 @@ def live(argv: list[str]) -> None:
     free = options.free()
     given = {"vision": options.vision, "touch": options.touch}
     engine = _engine(options.model, options.threads, tuple(m for m, texts in given.items() if texts))
-    streams: Any = _streams(options, engine)
+    wanted = sources(frame_shapes(engine), options.vision, options.touch)
+    _say_uncropped(engine, wanted)
+    streams: Any = {}
+    for m, texts in wanted.items():  # not yet open; several of one modality are numbered from 1
+        names = [m] if len(texts) == 1 else [f"{m} {i}" for i in range(1, len(texts) + 1)]
+        named = zip(names, texts, strict=True)
+        streams[m] = [Stream(name, source(text, m), stale_after=options.stale) for name, text in named]
     if not (options.vision or options.touch):
         _say("no --vision, no --touch: all sensors are simulated")
     sensor = options.sensor or next((stream.origin.sensor for stream in streams.get("touch", ())), "")
@@ -102,19 +108,6 @@ def live(argv: list[str]) -> None:
         _say(f"recorded: {options.record}, {num} pairs" if num else "nothing was recorded")
 
 
-def _streams(options: _Options, engine: Engine) -> dict[str, list[Stream]]:
-    """The streams by modality, not yet open; several of one modality are numbered from 1."""
-    given = sources(frame_shapes(engine), options.vision, options.touch)
-    _say_uncropped(engine, given)
-    return {
-        m: [
-            Stream(m if len(texts) == 1 else f"{m} {i}", source(text, m), stale_after=options.stale)
-            for i, text in enumerate(texts, 1)
-        ]
-        for m, texts in given.items()
-    }
-
-
 def _run(loop: Live, seconds: float | None) -> None:
     """Print every prediction and release until all streams ended, ``seconds`` are over, or Ctrl-C.
 
@@ -129,7 +122,9 @@ def _run(loop: Live, seconds: float | None) -> None:
             news.wait(0.05)
             news.clear()
             if said := loop.step():
-                print(_brief({"time": loop.clock() - start, **said}), flush=True)
+                line = json.dumps({"time": loop.clock() - start, **said})
+                short = json.loads(line, parse_float=lambda text: float(f"{float(text):.6g}"))
+                print(json.dumps(short), flush=True)
     except KeyboardInterrupt:
         _say("stopped")
     finally:
@@ -138,11 +133,6 @@ def _run(loop: Live, seconds: float | None) -> None:
         for thread in threads:
             thread.join(2.0)  # a device that hangs must not hang us
     loop.finish()
-
-
-def _brief(said: dict[str, Any]) -> str:
-    """JSON of ``said`` in one line, numbers with six digits."""
-    return json.dumps(json.loads(json.dumps(said), parse_float=lambda text: float(f"{float(text):.6g}")))
 
 
 @dataclass(frozen=True, kw_only=True)

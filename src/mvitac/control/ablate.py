@@ -28,7 +28,7 @@ from tabulate import tabulate
 from mvitac.control.learn import encoding, pixels, ridge
 from mvitac.control.suite import OWN
 from mvitac.data.pack import Pack
-from mvitac.data.windows import places
+from mvitac.data.windows import places, recordings
 from mvitac.datasets.lerobot import FELT
 from mvitac.deploy.artifact import load
 from mvitac.evaluation.intervals import mean_interval
@@ -84,7 +84,10 @@ class Recorded:
 
 
 def read_episodes(pack: Pack) -> Episodes:
-    """Episodes are the groups of ``pack``, of split test if it has two. ValueError without touch, action or two."""
+    """Episodes are the recordings of ``pack`` (column touch_group, else group), of split test if it has two.
+
+    ValueError without touch, action or two of them, or if two rows of one have the same place in it.
+    """
     values = {task.name: pack.values(task) for task in pack.spec.values}
     if "action" not in values or "touch" not in pack.spec.modalities:
         raise ValueError(f"{pack.path} has no touch, or no values named action: pack with --values action=a:mm,b:deg")
@@ -94,13 +97,15 @@ def read_episodes(pack: Pack) -> Episodes:
     least, most = np.fmin.reduce(values["action"]), np.fmax.reduce(values["action"])
     if not (least < most).any():
         raise ValueError(f"{pack.path}: values action never change, so no policy can be told from another")
-    which = np.unique(pack.column("group").astype(str), return_inverse=True)[1]
-    by = np.lexsort((places(pack, pack.spec.window)[1], which))
-    rows = np.split(by, np.cumsum(np.bincount(which))[:-1])
+    name, place = places(pack, pack.spec.window)
+    rows = list(recordings(pack, place))
+    if twice := [each for each in rows if (np.diff(place[each]) == 0).any()]:
+        two = f"{len(twice)} episodes have two rows with the same {name}, the first at row {twice[0][0]}"
+        raise ValueError(f"{pack.path}: {two}: pack with --touch-group RECORDING, or name another --data.order")
     unseen = [each for each in rows if (pack.column("split")[each] == "test").all()]
     of, rows = (" of split test", unseen) if len(unseen) > 1 else ("", rows)
     if len(rows) < 2:
-        raise ValueError(f"{pack.path} has one episode: episodes are its groups, give at least two")
+        raise ValueError(f"{pack.path} has one episode: episodes are its touch groups, give at least two")
     actions = values.pop("action")[np.concatenate(rows)]
     begin = [partial(Recorded, pack, each, values) for each in rows]
     return Episodes(begin, begin[0]().senses, pack.images, rows, actions, _touched(pack, rows), of=of)
@@ -109,7 +114,13 @@ def read_episodes(pack: Pack) -> Episodes:
 def _touched(pack: Pack, rows: Sequence[np.ndarray]) -> np.ndarray:
     """bool [N]: column "contact" if there is one, else whether touch differs from the episode's first frame."""
     if "contact" in pack.table.column_names:
-        return np.isin(pack.column("contact").astype(str), ("True", "true", "1", "1.0"))[np.concatenate(rows)]
+        said = np.char.lower(pack.column("contact").astype(str))[np.concatenate(rows)]
+        yes, no = np.isin(said, ("true", "yes", "1", "1.0")), np.isin(said, ("false", "no", "0", "0.0"))
+        if not (yes | no).all():
+            raise ValueError(
+                f"{pack.path}: column contact has {str(said[~(yes | no)][0])!r}: give yes or no in every row"
+            )
+        return yes
     found = []
     for each in rows:
         images = pack.images["touch"][each].astype(np.float32)

@@ -78,7 +78,7 @@ class LoopSuite:
 def rows_of(suite: Any, models: Sequence[Model]) -> list[Row]:
     """The encoder's seeds first, then the controls; ImageNet only where its weights can be had."""
     own = [Row(OWN, model.seed, ridge(encoding(model))) for model in models]
-    beside = [Row(n, None if n == "imagenet" else m.seed, ridge(encoding(m))) for n, m in trunks(suite)]
+    beside = [Row(n, None if n == "imagenet" else m.seed, ridge(encoding(m))) for n, m in trunks(suite)[0]]
     known = Row(suite.true, None, None), Row(suite.blind, None, blind)
     scratch = Row("end to end", None, trained(open_model(suite.untrained[0]), suite.train_steps))
     shuffled = Row(SHUFFLED, own[0].seed, own[0].learn)

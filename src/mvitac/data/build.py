@@ -95,7 +95,12 @@ def _build(source: Source, out: Path, request: dict[str, Any], workers: int, max
         raise ValueError(f"dataset {spec.name!r} has no samples to pack")
     partial = _Partial(out.with_name(out.name + ".partial"), spec, num, request)
     disk = partial.check_disk()
-    _claim(partial.folder, request)
+    asked = partial.folder / "request.json"
+    if not asked.exists():
+        write_json(asked, request)
+    elif read_json(asked, f"an unfinished pack's request (delete {asked.parent})") != json.loads(json.dumps(request)):
+        # Changed files are found part by part, by their stamps.
+        raise ValueError(f"{asked.parent} is an unfinished pack of something else: delete it or choose another --out")
     if not quiet:
         print(f"packing {num} samples at {size} px into {out}: {disk}")
     step = max(1, NUM_PART_ROWS * len(items) // max(len(items), num))
@@ -114,19 +119,6 @@ def _build(source: Source, out: Path, request: dict[str, Any], workers: int, max
     os.rename(partial.folder / "pack", out)
     shutil.rmtree(partial.folder)
     return Pack(out, verify=False)
-
-
-def _claim(partial: Path, request: dict[str, Any]) -> None:
-    """Write the request of a new build, or check that an interrupted build was of the same request.
-
-    Changed files are found part by part, by their stamps.
-    """
-    if not (partial / "request.json").exists():
-        write_json(partial / "request.json", request)
-        return
-    known = read_json(partial / "request.json", f"an unfinished pack's request (delete {partial})")
-    if known != json.loads(json.dumps(request)):
-        raise ValueError(f"{partial} is an unfinished pack of something else: delete it or choose another --out")
 
 
 def _append(path: Path, data: bytes) -> None:

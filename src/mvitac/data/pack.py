@@ -64,7 +64,13 @@ class Pack:
                 raise ValueError(f"digests: expected those of {', '.join(names)}")
         except ValueError as error:
             raise ValueError(f"{self.path / 'pack.json'} is damaged ({error}): re-pack it") from None
-        self.table: pa.Table = self._read_table()
+        self._check_digest("samples.parquet")
+        table = self._file("samples.parquet")
+        try:
+            self.table: pa.Table = pq.read_table(table)
+            check_table(self.table, self.spec)
+        except Exception as error:  # arrow raises several kinds for a damaged file
+            raise ValueError(f"{table} cannot be used ({brief(error)}): make the pack again") from None
         self.images: dict[str, Images] = {m: self._opened(m, self._file(name)) for name, m in files.items()}
         for name in files if verify else ():
             self._check_digest(name)
@@ -82,16 +88,6 @@ class Pack:
         if meta.get("digest", given := digest(rest)) != given:
             raise ValueError(f"{path} does not match its digest: it was changed or damaged, re-pack it")
         return meta
-
-    def _read_table(self) -> pa.Table:
-        self._check_digest("samples.parquet")
-        path = self._file("samples.parquet")
-        try:
-            table = pq.read_table(path)
-            check_table(table, self.spec)
-        except Exception as error:  # arrow raises several kinds for a damaged file
-            raise ValueError(f"{path} cannot be used ({brief(error)}): make the pack again") from None
-        return table
 
     def __repr__(self) -> str:
         return f"Pack({str(self.path)!r}: {self.num} rows of {self.spec.name} at {self.size} px)"

@@ -28,14 +28,20 @@ def check_table(table: pa.Table, spec: DataSpec) -> None:
     for name in (f"has_{modality}" for modality in spec.modalities):
         if name in table.column_names and (table.column(name).null_count or table.column(name).type != pa.bool_()):
             raise ValueError(f"column {name} holds {table.column(name).type}: write true or false in every row")
-    for column in spec.split_columns:
-        if column not in table.column_names:
-            raise unknown("column", column, table.column_names)
-        for split in table.column(column).unique().to_pylist():
+    for name in spec.split_columns:
+        if name not in table.column_names:
+            raise unknown("column", name, table.column_names)
+        for split in table.column(name).unique().to_pylist():
             if split not in SPLITS:
-                raise unknown(column, str(split), SPLITS)
+                raise unknown(name, str(split), SPLITS)
     for name, num in labels.items():
-        _check_labels(table.column(name), name, num)
+        column = table.column(name)
+        if not pa.types.is_integer(column.type):
+            raise ValueError(f"column {name} holds {column.type}: a label is 0 to {num - 1}, or -1 for none")
+        values = column.to_numpy()
+        if (bad := (values < -1) | (values >= num)).any():
+            row = _first(bad)
+            raise ValueError(f"{name} is {values[row]} in row {row}: give 0 to {num - 1}, or -1 for none")
     for name in controls:
         _check_numbers(table.column(name), name, "a control needs a number in every row", gaps=False)
     for name in targets:
@@ -47,15 +53,6 @@ def check_table(table: pa.Table, spec: DataSpec) -> None:
 
 def _first(bad: np.ndarray) -> int:
     return int(np.flatnonzero(bad)[0])
-
-
-def _check_labels(column: pa.ChunkedArray, name: str, num: int) -> None:
-    if not pa.types.is_integer(column.type):
-        raise ValueError(f"column {name} holds {column.type}: a label is 0 to {num - 1}, or -1 for none")
-    values = column.to_numpy()
-    if (bad := (values < -1) | (values >= num)).any():
-        row = _first(bad)
-        raise ValueError(f"{name} is {values[row]} in row {row}: give 0 to {num - 1}, or -1 for none")
 
 
 def _check_numbers(column: pa.ChunkedArray, name: str, need: str, *, gaps: bool) -> None:

@@ -144,7 +144,10 @@ class _Run:
         for packet in self._all():
             if packet is not None:
                 self.fed += packet is not self._ahead[0]
-                if not self._is_next(packet):
+                # Its place must be that of packet ``fed``, or 8 more, without the header of an AVI chunk: after damage, a
+                # demuxer may silently skip packets.
+                place = self._packets.places[self.fed] if self.fed < len(self._packets.places) else None
+                if place is None or packet.pos is None or packet.pos - int(place) not in {0, 8}:
                     self._note("its packet table and its packets disagree", _shown(packet))
                 if _shown(packet) >= self._shown and not packet.is_discard:
                     insort(due, _shown(packet))
@@ -152,12 +155,6 @@ class _Run:
                 if frame.pts is not None and frame.pts >= self._shown:
                     # Numbered by the packets, so that a frame dropped by the decoder does not shift the others.
                     yield self.first + bisect_left(due, frame.pts), frame
-
-    def _is_next(self, packet: Packet) -> bool:
-        """Whether ``packet`` is number ``fed``: after damage, a demuxer may silently skip packets."""
-        if self.fed >= len(self._packets.places) or packet.pos is None:
-            return False
-        return packet.pos - int(self._packets.places[self.fed]) in {0, 8}  # 8: without the header of an AVI chunk
 
     def _all(self) -> Iterator[Packet | None]:
         yield from self._ahead

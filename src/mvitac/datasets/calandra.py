@@ -139,7 +139,10 @@ class Calandra(Source):
 
     def __init__(self, config: CalandraConfig) -> None:
         self.config = config
-        self._files = {file: stamp_of(str(file)) for file in find_shards(config.path)}
+        shards = sorted(file for file in config.path.glob("*.h5") if SHARD.fullmatch(file.name))
+        if not shards:
+            raise ValueError(f"{config.path} has no calandra_corl2017_NNN.h5: download some (doi 10.25532/OPARA-700)")
+        self._files = {file: stamp_of(str(file)) for file in shards}
         everything = [grasp for file in self._files for grasp in list_grasps(file)]
         self._splits = split_objects(config, sorted({grasp.object for grasp in everything if not grasp.damage}))
         # Objects that the split leaves out are not read; damaged grasps are kept, to be listed.
@@ -185,13 +188,14 @@ class Calandra(Source):
             for phase in (phase for phase in PHASES if phase in self.config.phases):
                 names = (f"data/i{grasp.index}/{name}_{phase}" for name in ("gelsightA", "gelsightB", "kinectA_rgb"))
                 left, right, vision = (_image(file, name) for name in names)
+                labelled = {phase, "authors"} if phase == "during" or split == "train" else {phase}
                 columns = {
                     "id": f"{where}-{phase}",
                     "group": grasp.object,
                     "touch_group": where,
                     "split": split,
                     **{
-                        f"label_{TASKS[asked].name}": int(grasp.gripping) if may_ask(asked, phase, split) else -1
+                        f"label_{TASKS[asked].name}": int(grasp.gripping) if asked in labelled else -1
                         for asked in self.config.ask
                     },
                     "phase": phase,
@@ -202,14 +206,6 @@ class Calandra(Source):
                 both = np.concatenate([left.view("V3"), right.view("V3")], axis=2).view(np.uint8)
                 samples.append(Sample(vision=vision, touch=both, columns=columns))
         return samples
-
-
-def find_shards(path: Path) -> list[Path]:
-    """Return the shards in folder ``path``."""
-    files = sorted(file for file in path.glob("*.h5") if SHARD.fullmatch(file.name))
-    if not files:
-        raise ValueError(f"{path} has no calandra_corl2017_NNN.h5: download some (doi 10.25532/OPARA-700)")
-    return files
 
 
 def list_grasps(file: Path) -> list[Grasp]:
@@ -239,13 +235,6 @@ def _image(file: Any, name: str) -> np.ndarray:
         return file[name][()]
     except (OSError, KeyError, RuntimeError) as error:
         raise ValueError(f"{name} cannot be read ({brief(error)})") from None
-
-
-def may_ask(asked: Ask, phase: str, split: str) -> bool:
-    """Return whether a row of ``phase`` in ``split`` has the label of task ``asked``."""
-    if asked == "authors":
-        return phase == "during" or split == "train"
-    return phase == asked
 
 
 def split_objects(config: CalandraConfig, names: Sequence[str]) -> dict[str, str]:

@@ -46,6 +46,11 @@ class RosbagConfig(RecordedConfig):
         return path.suffix == ".bag" or (path / "metadata.yaml").is_file()
 
     def manifest(self) -> Manifest:
+        path, bags = self.path, [self.path] if self.reads(self.path) else []
+        if not bags and path.is_dir():
+            bags = sorted([*(file.parent for file in path.rglob("metadata.yaml")), *path.rglob("*.bag")])
+        if not bags:
+            raise ValueError(f"{path} is no bag and holds none: give a folder with metadata.yaml, a .bag, or several")
         cameras = [topic for topic in (*self.touch, self.vision) if topic]
         named = *self.labels, *self.numbers(), *self.conditioned()
         named = *named, self.group, self.touch_group, self.split, self.sensor
@@ -53,7 +58,7 @@ class RosbagConfig(RecordedConfig):
         rows: list[Row] = []
         images: dict[str, list[ImageRef | None]] = {topic: [] for topic in cameras}
         dropped = 0
-        for bag in _bags(self.path):
+        for bag in bags:
             seen = _read(bag, cameras, [name for name in dict.fromkeys(named) if name])
             own = seen[cameras[0]][0][::every]
             if not len(own):
@@ -78,15 +83,6 @@ class RosbagConfig(RecordedConfig):
                     images[topic].append(Message(str(bag), topic, *at[topic][i]))
         note = f"topics are joined by time within {self.tolerance:g} s; {dropped} images without all others left out"
         return Manifest.of(self.path, rows, images, notes=(note,))
-
-
-def _bags(path: Path) -> list[Path]:
-    found = [path] if RosbagConfig.reads(path) else []
-    if not found and path.is_dir():
-        found = sorted([*(file.parent for file in path.rglob("metadata.yaml")), *path.rglob("*.bag")])
-    if not found:
-        raise ValueError(f"{path} is no bag and holds none: give a folder with metadata.yaml, a .bag, or several")
-    return found
 
 
 @contextmanager

@@ -51,8 +51,25 @@ class SlipGSMiniConfig(RowsConfig):
                 both = tuple(digest_file(folder / name) for name in FINGERS.values())
                 copies.setdefault(both, []).append(folder)
         rows: list[dict[str, str]] = []
-        for folders in copies.values():
-            rows += self._recording(root, folders)
+        for folders in copies.values():  # of one recording
+            folder = folders[0]
+            slips = {(copy / "slip.txt").exists() for copy in folders}
+            name = min(ALIASES.get(copy.parent.name, copy.parent.name) for copy in folders)
+            where = {"base_data_for_training": "train", "base_data_for_validation": "val"}
+            sides = {where.get(part) for copy in folders for part in copy.parts} - {None}
+            length = min(num_frames(folder / video) for video in FINGERS.values())
+            place = folder.relative_to(root)
+            known = {
+                **{finger: (place / video).as_posix() for finger, video in FINGERS.items()},
+                "experiment": place.as_posix(),
+                "object": name,
+                "slip": str(int(slips.pop())) if len(slips) == 1 else "",
+                "n_frames": str(length),
+                "copies": str(len(folders)),
+                "author_split": "train" if "train" in sides else "val" if sides else "extra",
+            }
+            known["label_conflict"] = str(int(not known["slip"]))
+            rows += [{**known, "frame": str(at), "seq": str(i)} for i, at in enumerate(spread(NUM_FRAMES, length))]
         if not rows:
             raise ValueError(f"{root} has no folder with both {' and '.join(FINGERS.values())}: clone it whole")
         often: dict[str, list[int]] = {}
@@ -61,24 +78,3 @@ class SlipGSMiniConfig(RowsConfig):
         strata = [f"{sum(often[row['object']]) / len(often[row['object']]):.2f}" for row in rows]
         add_folds(rows, strata, 3)
         return Manifest.of(root, rows)
-
-    def _recording(self, root: Path, folders: list[Path]) -> list[dict[str, str]]:
-        """Return the rows of one recording, of which each of ``folders`` is a copy."""
-        folder = folders[0]
-        slips = {(copy / "slip.txt").exists() for copy in folders}
-        name = min(ALIASES.get(copy.parent.name, copy.parent.name) for copy in folders)
-        where = {"base_data_for_training": "train", "base_data_for_validation": "val"}
-        sides = {where.get(part) for copy in folders for part in copy.parts} - {None}
-        length = min(num_frames(folder / video) for video in FINGERS.values())
-        place = folder.relative_to(root)
-        known = {
-            **{finger: (place / video).as_posix() for finger, video in FINGERS.items()},
-            "experiment": place.as_posix(),
-            "object": name,
-            "slip": str(int(slips.pop())) if len(slips) == 1 else "",
-            "n_frames": str(length),
-            "copies": str(len(folders)),
-            "author_split": "train" if "train" in sides else "val" if sides else "extra",
-        }
-        known["label_conflict"] = str(int(not known["slip"]))
-        return [{**known, "frame": str(at), "seq": str(seq)} for seq, at in enumerate(spread(NUM_FRAMES, length))]

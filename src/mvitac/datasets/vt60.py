@@ -57,9 +57,5 @@ class VT60Config(RowsConfig):
 
 def _by_number(folder: Path) -> list[Path]:
     """Return the images of ``folder``, sorted by the number after img_, then by name."""
-
-    def key(path: Path) -> tuple[int, str]:
-        found = re.search(r"img_(\d+)", path.name)
-        return (int(found[1]) if found else -1, path.name)
-
-    return sorted(folder.glob("*.jpg"), key=key)
+    numbers = {path: re.search(r"img_(\d+)", path.name) for path in folder.glob("*.jpg")}
+    return sorted(numbers, key=lambda path: (int(found[1]) if (found := numbers[path]) else -1, path.name))

@@ -69,7 +69,12 @@ def export(
             write_onnx(graph, partial / MODEL)
             if config.precision == "int8":
                 quantise(partial / MODEL, list(graph.inputs), _examples(graph, pack))
-        report, wanted = _measure(model, graph, partial / MODEL, pack, rows, config)
+        call = open_model(partial / MODEL, "openvino" if config.precision == "bf16" else "auto", config.precision)
+        with work("checking the outputs of the export"):
+            wanted = reference(model, graph, pack, rows)
+            report = parity(graph, call, pack, rows, wanted, **config.tolerance)
+            report["size_mb"] = round((partial / MODEL).stat().st_size / 1e6, 2)
+            report["latency_ms"] = latency(call, [pack.images[m][rows[:1]] for m in graph.modalities])
         # A few real inputs and the outputs of the trained model, which ``Engine`` repeats where it is opened.
         some = np.linspace(0, len(rows) - 1, min(len(rows), NUM_CHECK)).astype(int)
         check = {f"input_{m}": pack.images[m][rows[some]] for m in graph.modalities}
@@ -106,19 +111,6 @@ def silent() -> Iterator[None]:
             yield
     finally:
         logging.disable(level)
-
-
-def _measure(
-    model: Model, graph: ExportModule, path: Path, pack: Pack, rows: np.ndarray, config: ExportConfig
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    engine = "openvino" if config.precision == "bf16" else "auto"
-    call = open_model(path, engine, config.precision)
-    with work("checking the outputs of the export"):
-        wanted = reference(model, graph, pack, rows)
-        report = parity(graph, call, pack, rows, wanted, **config.tolerance)
-        report["size_mb"] = round(path.stat().st_size / 1e6, 2)
-        report["latency_ms"] = latency(call, [pack.images[m][rows[:1]] for m in graph.modalities])
-    return report, wanted
 
 
 def reference(model: Model, graph: ExportModule, pack: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:

@@ -82,9 +82,8 @@ def _error(target: dict[str, Any], true: np.ndarray, guess: np.ndarray) -> Error
 def _scores(run: Path, model: Model, pack: Pack, records: Records) -> dict[str, Any]:
     """The probes' ``records`` with those of the controls, as printed by ``mvitac probe``, JSON-ready."""
     own = {"source": model.run.method.name, "seed": model.run.seed}
-    stored = stored_result([run], pack)
-    tasks = {record["task"] for record in records}
-    if stored:
+    if stored := stored_result([run], pack):
+        tasks = {record["task"] for record in records}
         controls = [r for r in stored["records"] if "run" not in r and r["task"] in tasks]
     else:
         controls = _controls(model, pack, records)

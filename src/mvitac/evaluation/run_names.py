@@ -31,7 +31,11 @@ def names_of(paths: Sequence[Path], models: Sequence[Model]) -> list[str]:
     where: dict[Path, str] = {}
     for kinds in alike.values():
         folders = [list(seeds.values()) for seeds in kinds.values()]
-        for group, place in zip(folders, _places(folders), strict=True):
+        # Each place is the folder that a group shares or, where these are not distinct, all of the group's folders.
+        places = [Path(os.path.commonpath([path.resolve() for path in group])).name for group in folders]
+        if len(set(places)) < len(folders):
+            places = [", ".join(map(str, group)) for group in folders]
+        for group, place in zip(folders, places, strict=True):
             where |= dict.fromkeys(group, f" ({place})" if len(folders) > 1 else "")
     return [name + where[path] for name, path in zip(names, paths, strict=True)]
 
@@ -42,9 +46,3 @@ def _settings(path: Path, model: Model) -> str:
     data = record.get("pack") or to_json(model.run.data)
     # The precision that was asked for: `auto` may mean another one for each seed.
     return digest([replace(model.run, seed=0, data=PackConfig(), precision=asked.precision).digest(), data])
-
-
-def _places(groups: Sequence[Sequence[Path]]) -> list[str]:
-    """Distinct names of groups of folders: that of the folder which a group shares, else all of its folders."""
-    shared = [Path(os.path.commonpath([path.resolve() for path in group])).name for group in groups]
-    return shared if len(set(shared)) == len(groups) else [", ".join(map(str, group)) for group in groups]

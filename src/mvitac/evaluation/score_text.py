@@ -71,10 +71,9 @@ def tested_on(task: dict[str, Any], group_by: str) -> str:
     """The test groups of one task's summary, such as '24 test instances'; too few allow no interval."""
     nums = {cell["groups"] for cells in task.values() for cell in cells.values()}
     text = f"{' to '.join(str(num) for num in sorted({min(nums), max(nums)}))} test {group_by}{'s' * (nums != {1})}"
-    endless = [
-        c for cells in task.values() for c in cells.values() if c["low"] is None and percent(c["high"]) == "100.0"
-    ]
-    return text + (", so no interval" if nums == {1} else ", too few for some intervals" * bool(endless))
+    ends = ((cell["low"], percent(cell["high"])) for cells in task.values() for cell in cells.values())
+    endless = any(low is None and high == "100.0" for low, high in ends)
+    return text + (", so no interval" if nums == {1} else ", too few for some intervals" * endless)
 
 
 def columns_of(task: dict[str, Any]) -> list[str]:

@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.data.pack import Pack
-from mvitac.data.spec import AnyTask
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
 from mvitac.evaluation.retrieval import MIN_GALLERY
 from mvitac.evaluation.scores import pool, pool_retrieval
@@ -28,12 +26,20 @@ def lay_out_folds(plan: Plan, out: Path, session: ProbeConfig, device: str = "au
     ValueError if two folds test the same group, or no row is left.
     """
     works: list[Work] = []
-    tested: dict[tuple[str, str], str] = {}
+    tested: dict[tuple[str, str], str] = {}  # (split column, group) -> fold
     for fold, part in plan.in_folds():
         assert part.data is not None
         pack = part.data.open()
         if fold:
-            _check_tested_once(fold, pack, chosen(pack, session)[0], tested)
+            groups = pack.column("group").astype(str)
+            columns = dict.fromkeys(("split", *(task.split for task in chosen(pack, session)[0])))
+            held = {name: np.unique(groups[pack.rows("test", by=name)]).tolist() for name in columns}
+            for column, group in ((name, group) for name, names in held.items() for group in names):
+                if (column, group) in tested:
+                    own = "" if column == "split" else f" (column {column})"
+                    both = f"folds {tested[column, group]!r} and {fold!r} both test {pack.spec.group_by} {group!r}{own}"
+                    raise ValueError(f"{both}: each group must be tested once")
+                tested[column, group] = fold
         work = lay_out(part, pack, out / fold, session, device)
         works.append(replace(work, jobs=[replace(job, fold=fold) for job in work.jobs]))
     left_out = {label: reason for work in works for label, reason in work.left_out.items()}
@@ -42,18 +48,6 @@ def lay_out_folds(plan: Plan, out: Path, session: ProbeConfig, device: str = "au
     if not works[0].jobs:
         raise ValueError(f"plan {plan.name!r} has no row that all folds allow: {next(iter(left_out.values()))}")
     return works
-
-
-def _check_tested_once(fold: str, pack: Pack, tasks: Sequence[AnyTask], tested: dict[tuple[str, str], str]) -> None:
-    """Add the test groups of ``fold`` to ``tested``: (split column, group) -> fold."""
-    groups = pack.column("group").astype(str)
-    for column in dict.fromkeys(("split", *(task.split for task in tasks))):
-        own = "" if column == "split" else f" (column {column})"
-        for group in np.unique(groups[pack.rows("test", by=column)]).tolist():
-            if (column, group) in tested:
-                both = f"folds {tested[column, group]!r} and {fold!r} both test {pack.spec.group_by} {group!r}{own}"
-                raise ValueError(f"{both}: each group must be tested once")
-            tested[column, group] = fold
 
 
 def together(works: Sequence[Work]) -> Work:

@@ -41,7 +41,12 @@ def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
         text += [f"**{task}**: {TARGETS}"] * bool(task) + ["", *pipes(heads, rows)]
     if rows := retrieval_rows(result["retrieval"]):
         text += pipes(["retrieval", "", *(f"{name} %" for name in RETRIEVAL)], rows)
-    return "\n".join([*text, *_cost(result)]).rstrip() + "\n"
+    heads = ["cost of one run", "from", "seeds", "steps", "pairs", "images seen", "trained weights", "seconds"]
+    rows = []
+    for c in result["cost"]:
+        numbers = [str(c[key]) for key in ("row", "pairs_of", "seeds", "steps", "pairs", "images")]
+        rows.append([*numbers, f"{c['trained_parameters'] / 1e6:.2f} M", f"{c['seconds']:.0f}"])
+    return "\n".join([*text, *pipes(heads, rows)]).rstrip() + "\n"
 
 
 def _tables(result: dict[str, Any], lines: Sequence[Line]) -> Iterator[tuple[str, list[str], list[list[str]]]]:
@@ -64,7 +69,8 @@ def _table(
     for line in lines:
         name = f"*{line.source}*" if line.control else line.source  # in italics
         rows.append([name, "" if line.modality == "none" else line.modality])
-    for task, score in _columns(lines).items():
+    scores = {t: "R2" if "targets" in cell else "accuracy" for line in lines for t, cell in line.cells.items()}
+    for task, score in scores.items():
         heads += [f"{task} {'R2 ' * (score == 'R2')}%", *["error"] * targets, *["printed"] * shown, f"to {reference}"]
         for line, row in zip(lines, rows, strict=True):
             if cell := line.cells.get(task):
@@ -74,11 +80,6 @@ def _table(
             else:
                 row += [""] * (2 + targets + shown)
     return heads, rows
-
-
-def _columns(lines: Sequence[Line]) -> dict[str, str]:
-    """What each column scores: task or target -> "accuracy" or "R2"."""
-    return {t: "R2" if "targets" in cell else "accuracy" for line in lines for t, cell in line.cells.items()}
 
 
 def _gap(cell: dict[str, Any]) -> str:
@@ -145,10 +146,8 @@ def _budget(result: dict[str, Any]) -> str:
     text = "budgets differ (see cost)"
     if len(budgets) == 1:
         text = "equal budget: every run saw {} pairs in {} steps".format(*budgets.pop())
-    sets = {row.label: [name for name, _ in dotted(row.set)] for row in plan_of(result).rows}
-    begun = [
-        label for label, names in sets.items() if any(n.startswith("init") or n.endswith("weights") for n in names)
-    ]
+    fields = ((row.label, name) for row in plan_of(result).rows for name, _ in dotted(row.set))
+    begun = dict.fromkeys(label for label, name in fields if name.startswith("init") or name.endswith("weights"))
     text += f"; not counted is what the weights that {', '.join(begun)} started from had seen" * bool(begun)
     same_rows = len({c["pairs_of"] for c in result["cost"]}) < 2
     return text if same_rows else f"{text}, **pairs are not from the same rows (see cost)**"
@@ -162,15 +161,6 @@ def _made(result: dict[str, Any]) -> str:
     runs = list(dict.fromkeys(runs))
     code = f"code {tables}" if runs == [tables] else f"runs at commits {', '.join(runs)}; tables at {tables}"
     return ", ".join([code, *result["run_devices"]])
-
-
-def _cost(result: dict[str, Any]) -> list[str]:
-    heads = ["cost of one run", "from", "seeds", "steps", "pairs", "images seen", "trained weights", "seconds"]
-    rows = []
-    for c in result["cost"]:
-        numbers = [str(c[key]) for key in ("row", "pairs_of", "seeds", "steps", "pairs", "images")]
-        rows.append([*numbers, f"{c['trained_parameters'] / 1e6:.2f} M", f"{c['seconds']:.0f}"])
-    return pipes(heads, rows)
 
 
 def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:

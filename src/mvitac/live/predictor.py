@@ -130,8 +130,16 @@ class Live:
         images, given = self.see({m: [frame for frame in found if frame] for m, found in frames.items()})
         if not self.contact:
             self.finish()
-        if given:
-            self._predict(given, min(f.time for f in frames[self._leads] if f))
+        if given:  # add a prediction to the current touch, or start one
+            self.answer = self.touch or Touch()
+            if self.contact:
+                self.touch = self.answer
+            self.outputs = outputs = self.engine(**{m: image[None] for m, image in given.items()})
+            classes = {task: outputs[f"probability_{task}"][0] for task in self.engine.classes}
+            self.answer.add(classes, {task: outputs[f"value_{task}"][0] for task in self.engine.values})
+            self.ages.append(self.clock() - min(f.time for f in frames[self._leads] if f))
+            self.max_age = max(self.max_age, self.ages[-1])
+            self.num_predictions += 1
         if self.record:
             self.record(images, {"time": now, "contact": bool(self.contact), "touch_number": self.num_touches})
         return given is not None
@@ -167,18 +175,6 @@ class Live:
             for several, found in zip(self.streams.values(), frames.values(), strict=True)
             for stream, frame in zip(several, found, strict=True)
         )
-
-    def _predict(self, given: dict[str, np.ndarray], captured: float) -> None:
-        """Add a prediction from what the model gets to the current touch, or start one."""
-        self.answer = self.touch or Touch()
-        if self.contact:
-            self.touch = self.answer
-        self.outputs = outputs = self.engine(**{m: image[None] for m, image in given.items()})
-        classes = {task: outputs[f"probability_{task}"][0] for task in self.engine.classes}
-        self.answer.add(classes, {task: outputs[f"value_{task}"][0] for task in self.engine.values})
-        self.ages.append(self.clock() - captured)
-        self.max_age = max(self.max_age, self.ages[-1])
-        self.num_predictions += 1
 
     def finish(self) -> None:
         """End the current touch."""

@@ -87,7 +87,12 @@ class Stream:
             self._say("damaged frame", f"skipped a damaged frame ({brief(error)})")
             return
         except Exception as error:  # OSError, or one of the exceptions of OpenCV and its drivers
-            self._lost(error)
+            self.origin.close()
+            self._open = False
+            self._retry_at = self.clock() + RETRY_EVERY
+            if self.fault != "unplugged":
+                self._arrivals.clear()
+                self._say("unplugged", f"is gone ({brief(error)}): trying again every {RETRY_EVERY:g} s")
             return
         self.take(image)
 
@@ -161,14 +166,6 @@ class Stream:
                 self._past.append((captured, fit(image, self._side)))
                 while len(self._past) > 1 and self._past[1][0] <= captured - self._keep:
                     self._past.popleft()
-
-    def _lost(self, error: Exception) -> None:
-        self.origin.close()
-        self._open = False
-        self._retry_at = self.clock() + RETRY_EVERY
-        if self.fault != "unplugged":
-            self._arrivals.clear()
-            self._say("unplugged", f"is gone ({brief(error)}): trying again every {RETRY_EVERY:g} s")
 
     def _recovered(self) -> None:
         what, self.fault = _RECOVERED[self.fault], ""

@@ -62,14 +62,6 @@ def split_patches(noise: Float[Tensor, "B N"], mask_ratio: float) -> tuple[Int[T
     return order[:, :visible], order[:, visible:]
 
 
-def pixel_targets(values: Float[Tensor, "B N P"], pixel_norm: bool) -> Float[Tensor, "B N P"]:
-    """What the decoder must predict of each patch."""
-    if not pixel_norm:
-        return values
-    variance, mean = torch.var_mean(values, dim=2, keepdim=True, correction=1)
-    return (values - mean) / (variance + EPS).sqrt()
-
-
 class MAE(Contrastive):
     """A ViT and a decoder per modality. Width and depth of a decoder are two thirds of the trunk's, at most 512 and 8."""
 
@@ -96,7 +88,10 @@ class MAE(Contrastive):
             predicted = self.decoders[modality](seen[modality], hidden[modality][:, None])[:, 0]
             with torch.autocast(images.device.type, enabled=False):
                 values = vit.take(vit.patches(trunk, images.float()), hidden[modality])
-                error = (predicted.float() - pixel_targets(values, self.config.pixel_norm)) ** 2
+                if self.config.pixel_norm:
+                    variance, mean = torch.var_mean(values, dim=2, keepdim=True, correction=1)
+                    values = (values - mean) / (variance + EPS).sqrt()
+                error = (predicted.float() - values) ** 2
                 result["loss", modality] = error.flatten(1).mean(1)
         return result
 

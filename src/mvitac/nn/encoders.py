@@ -41,8 +41,8 @@ def mvitac_tiny(pretrained: bool = False, **kwargs: Any) -> ResNet:
 def mvitac_resnet8(pretrained: bool = False, **kwargs: Any) -> ResNet:
     """timm's ResNet-10-T without its last stage, for images of some 48 px (256 features, 1.2 M parameters)."""
     _from_scratch("mvitac_resnet8", pretrained, kwargs)
-    shape: dict[str, Any] = {"stem_width": 32, "stem_type": "deep_tiered", "avg_down": True}
-    trunk = ResNet(BasicBlock, (1, 1, 1, 1), **shape, **kwargs)
+    shape: dict[str, Any] = {"block": BasicBlock, "layers": (1, 1, 1, 1), "stem_width": 32, "stem_type": "deep_tiered"}
+    trunk = ResNet(**shape, avg_down=True, **kwargs)
     trunk.layer4, trunk.num_features, trunk.head_hidden_size = nn.Identity(), 256, 256  # type: ignore[assignment]
     del trunk.feature_info[-1]
     return trunk

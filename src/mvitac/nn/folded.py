@@ -18,8 +18,9 @@ def folded(network: nn.Module) -> nn.Module:
     network = copy.deepcopy(network)
     for parent in [*network.modules()]:
         for (first, conv), (second, norm) in pairwise([*parent.named_children()]):
-            known = isinstance(conv, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d) and norm.running_mean is not None
-            if known and conv.out_channels == norm.num_features:
+            if not isinstance(conv, nn.Conv2d) or not isinstance(norm, nn.BatchNorm2d):
+                continue
+            if norm.running_mean is not None and conv.out_channels == norm.num_features:
                 setattr(parent, first, fuse_conv_bn_eval(conv, norm))
                 setattr(parent, second, getattr(norm, "act", nn.Identity()))  # timm's norm has its activation
     return network

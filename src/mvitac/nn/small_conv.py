@@ -54,11 +54,12 @@ class DepthwiseConv2dSame(Conv2dSame):
     def forward(self, input: Tensor) -> Tensor:
         if _pays(self, input):
             return _depthwise(self, pad_same(input, self.kernel_size, self.stride), 0)  # type: ignore[arg-type]
-        if torch.compiler.is_compiling() or self.stride != (2, 2) or any(side % 2 for side in input.shape[-2:]):
+        conv: Any = self
+        if torch.compiler.is_compiling() or conv.stride != (2, 2) or any(side % 2 for side in input.shape[-2:]):
             return super().forward(input)
         # One more pixel right and below: a kernel with a row and a column of zeros needs no copy of the map.
-        kernel = F.pad(self.weight, (1, 0, 1, 0))
-        return torch.conv2d(input, kernel, self.bias, 2, self.kernel_size[0] // 2, 1, self.groups)
+        kernel = F.pad(conv.weight, (1, 0, 1, 0))
+        return torch.conv2d(input, kernel, conv.bias, 2, conv.kernel_size[0] // 2, 1, conv.groups)
 
 
 def _pays(conv: Any, input: Tensor) -> bool:

@@ -1,7 +1,5 @@
 """Pictures of rows that the features confuse."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from markupsafe import Markup
 
@@ -53,8 +51,13 @@ def mistakes(study: Study) -> list[Markup]:
         strips = []
         for at in (sample(np.flatnonzero(wrong), NUM_QUERIES) if known else spread(values, NUM_QUERIES)).tolist():
             kinds = ("" if labels[i] < 0 else "same class" if labels[i] == labels[at] else "other" for i in near[at])
-            found = list(zip(rows[near[at]].tolist(), kinds, strict=True))
-            strips.append(_strip(study, modality, int(rows[at]), found))
+            image, name = _picture(study, modality, int(rows[at]))
+            cells = [html.cell("asked", image, "", name)]
+            for other, kind in zip(rows[near[at]].tolist(), kinds, strict=True):
+                css, mark = _SHOWN[kind]
+                image, name = _picture(study, modality, other)
+                cells.append(html.cell(css, image, mark, name))
+            strips.append(html.grid(cells, "query"))
         title = f"{modality}: {wrong.sum()} of {len(shown)} rows" if known else modality
         halves.append(html.card(title, strips))
     by, name = pack.spec.group_by, study.runs[0].path.name
@@ -68,17 +71,6 @@ def mistakes(study: Study) -> list[Markup]:
 
 
 _SHOWN = {"": ("", ""), "other": ("wrong", "\u2715 another class"), "same class": ("same", "\u2248 same class")}
-
-
-def _strip(study: Study, modality: str, row: int, found: Sequence[tuple[int, str]]) -> Markup:
-    """The picture of ``row`` and those of the rows ``found``, with their class and id."""
-    image, name = _picture(study, modality, row)
-    cells = [html.cell("asked", image, "", name)]
-    for other, kind in found:
-        css, mark = _SHOWN[kind]
-        image, name = _picture(study, modality, other)
-        cells.append(html.cell(css, image, mark, name))
-    return html.grid(cells, "query")
 
 
 def _picture(study: Study, modality: str, row: int) -> tuple[Markup, str]:

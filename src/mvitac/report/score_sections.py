@@ -32,7 +32,11 @@ def probe(study: Study) -> list[Markup]:
         again = summarise_again(records, kind)
         names = " and ".join(dict.fromkeys(tables.probe_name(kind, score_name(cells)) for cells in again.values()))
         numbers.append(html.fold(f"The same by {names}", html.grid(_scores(study, again), "")))
-    numbers += _per_class(study)
+    for task, modality, sources, classes in tables.classes_of(study.result):
+        heads = ["class", "rows", "groups", *(f"{source}: precision / recall" for source in sources)]
+        table = html.table(heads, tables.class_rows(classes, sources), label=f"{task}: classes")
+        title = f"Every class of {task}, by {score_text.WORDS[modality]}: precision and recall (%)"
+        numbers.append(html.fold(title, table))
     names = " or ".join(dict.fromkeys(tables.probe_name(kinds[0], score_name(found)) for found in summary.values()))
     by = study.pack.spec.group_by
     intro = f"A probe ({names}) on frozen features, scored on {tables.unseen_groups(by, records)}."
@@ -76,17 +80,6 @@ def _target_table(study: Study, task: str, found: dict[str, Any]) -> Markup:
     heads = [head for m in columns_of(found) for head in (f"{m}: R2 %", "mean absolute error")]
     table = html.table([task, *heads], rows, muted={*sources_of(found)} - {*study.sources}, label=f"{task}: targets")
     return table + (html.paragraph(f"{clipped}.") if (clipped := score_text.clipped_text(found)) else "")
-
-
-def _per_class(study: Study) -> list[Markup]:
-    """Rows, groups, precision and recall of each class, folded: a table per task."""
-    found = []
-    for task, modality, sources, classes in tables.classes_of(study.result):
-        heads = ["class", "rows", "groups", *(f"{source}: precision / recall" for source in sources)]
-        table = html.table(heads, tables.class_rows(classes, sources), label=f"{task}: classes")
-        title = f"Every class of {task}, by {score_text.WORDS[modality]}: precision and recall (%)"
-        found.append(html.fold(title, table))
-    return found
 
 
 def values(study: Study) -> list[Markup]:

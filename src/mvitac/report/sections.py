@@ -1,6 +1,7 @@
 """Sections of the report: retrieval, training curves, confusion matrices. Each is a list of blocks, empty if there is
 nothing to show."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -132,7 +133,14 @@ def collapse(study: Study) -> list[Markup]:
     drawn = []
     chances = [e["eval"]["chance R@5"] for r in study.runs for e in r.log if "chance R@5" in e.get("eval", {})]
     for title, keys, caption in _panels(study):
-        if lines := _panel_lines(study, keys):
+        lines = []
+        for (key, (label, hue)), r in itertools.product(keys.items(), study.runs):
+            steps, values = _column([{"step": e["step"], **e["eval"]} for e in r.log if "eval" in e], key)
+            if steps:
+                name = label if len(study.sources) == 1 else f"{label}, {r.source}"
+                dash = figures.DASHES[study.sources.index(r.source) % len(figures.DASHES)]
+                lines.append(Line(name, steps, values, hue, dash))
+        if lines:
             chance = {"chance": chances[0]} if title == "retrieval R@5" and chances else {}
             drawing = figures.curves(title, lines, chance)
             drawn.append(study.figure(title, drawing, f"{title} over the steps. {caption}", caption))
@@ -160,18 +168,6 @@ def _panels(study: Study) -> list[tuple[str, dict[str, tuple[str, str]], str]]:
         *((f"linear probe, {task.name}", each(f"linear {task.name}"), probe) for task in study.pack.spec.all_tasks),
         ("retrieval R@5", across, "Own group among the first five, in the space both share."),
     ]
-
-
-def _panel_lines(study: Study, keys: dict[str, tuple[str, str]]) -> list[Line]:
-    lines = []
-    for key, (label, hue) in keys.items():
-        for r in study.runs:
-            steps, values = _column([{"step": e["step"], **e["eval"]} for e in r.log if "eval" in e], key)
-            if steps:
-                name = label if len(study.sources) == 1 else f"{label}, {r.source}"
-                dash = figures.DASHES[study.sources.index(r.source) % len(figures.DASHES)]
-                lines.append(Line(name, steps, values, hue, dash))
-    return lines
 
 
 def confusions(study: Study) -> list[Markup]:

@@ -52,7 +52,12 @@ def print_summary(result: dict[str, Any], file: TextIO | None = None, *, probe: 
             print(textwrap.fill(line, 80, subsequent_indent="  "), file=file)
         print(file=file)
         if score == "R2":
-            print(_targets(name, task), file=file)
+            rows, above = [], ""
+            for target, source, cells in target_rows(task):
+                scores = (f"{percent(cell['mean'])}, {error_text(cell)}" if cell else "" for cell in cells)
+                rows.append([target * (target != above), source, *scores])
+                above = target
+            print(text_table(f"{name}: R2 % and mean absolute error", ["", "", *modalities], rows, words=2), file=file)
         if clipped := score_text.clipped_text(task):
             print(textwrap.fill(clipped, 80, subsequent_indent="  "), file=file)
     _print_notes(result, trained, file)
@@ -68,15 +73,6 @@ def _print_notes(result: dict[str, Any], records: Sequence[dict[str, Any]], file
     for kind, key in (("note", "notes"), ("LEAK", "leaks")):
         for text in result.get(key, ()):
             print(textwrap.fill(f"{kind}: {text}", 80, subsequent_indent="  "), file=file)
-
-
-def _targets(name: str, task: dict[str, Any]) -> str:
-    rows, above = [], ""
-    for target, source, cells in target_rows(task):
-        scores = (f"{percent(cell['mean'])}, {error_text(cell)}" if cell else "" for cell in cells)
-        rows.append([target * (target != above), source, *scores])
-        above = target
-    return text_table(f"{name}: R2 % and mean absolute error", ["", "", *columns_of(task)], rows, words=2)
 
 
 def classes_of(result: dict[str, Any]) -> Iterator[tuple[str, str, list[str], list[dict[str, Any]]]]:
@@ -155,9 +151,14 @@ def print_finetuning(result: dict[str, Any], file: TextIO | None = None) -> None
         (_, ours), *others = cells.items()
         score = "R2" if "r2" in next(iter(ours.values()))[0] else "accuracy"
         columns = [f"{score} %", *(f"{f:g} % of {result['group_by']}s" for f in ours)]
-        texts = {s: [with_interval(*interval(e), leaks_in(e)) for e in found.values()] for s, found in cells.items()}
-        rows = [[source, *(text.replace(" LEAK", "\nLEAK") for text in found)] for source, found in texts.items()]
-        rows += [[f"gain over {s}", *(_gain_text(ours[f], found[f]) for f in ours)] for s, found in others]
+        rows = []
+        for source, found in cells.items():
+            texts = (with_interval(*interval(each), leaks_in(each)) for each in found.values())
+            rows.append([source, *(text.replace(" LEAK", "\nLEAK") for text in texts)])
+        for source, found in others:
+            gaps = (paired_difference(ours[fraction], found[fraction])[:3] for fraction in ours)
+            texts = (f"{100 * mean:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]" for mean, low, high in gaps)
+            rows.append([f"gain over {source}", *texts])
         print(text_table(f"{result['data']}: {task}", columns, rows), file=file)
     _print_notes(result, result["records"], file)
 
@@ -167,9 +168,3 @@ def text_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]
     align = ["left"] * words + ["right"] * (len(columns) - words)
     table = tabulate(rows, columns, "simple", disable_numparse=True, colalign=align if rows else None)
     return f"{title}\n{table}\n"
-
-
-def _gain_text(ours: Sequence[dict[str, Any]], theirs: Sequence[dict[str, Any]]) -> str:
-    """The paired difference in points with its interval, such as '+3.1 [+0.4, +5.8]'."""
-    mean, low, high, _ = paired_difference(ours, theirs)
-    return f"{100 * mean:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"

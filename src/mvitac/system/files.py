@@ -23,7 +23,11 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object]) -> None:
     check_ordinary(path)
     path = path.resolve() if path.is_symlink() else path
     path.parent.mkdir(parents=True, exist_ok=True)
-    _remove_orphans(path)
+    for name in os.listdir(path.parent):  # what killed processes left
+        if name.endswith(".tmp") and (found := _TEMPORARY.fullmatch(name)) and found[1] == path.name:
+            with contextlib.suppress(FileNotFoundError):
+                if time.time() - path.with_name(name).stat().st_mtime > _STALE:
+                    path.with_name(name).unlink()
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         with naming(path), temporary.open("wb") as file:
@@ -46,15 +50,6 @@ _STALE = 600  # seconds after which nobody is still writing a temporary file
 def is_temporary(path: Path) -> bool:
     """Return whether ``path`` has the name of a temporary file of ``write_atomic``."""
     return _TEMPORARY.fullmatch(path.name) is not None
-
-
-def _remove_orphans(path: Path) -> None:
-    """Remove temporary files of ``path`` that a killed process left."""
-    for name in os.listdir(path.parent):
-        if name.endswith(".tmp") and (found := _TEMPORARY.fullmatch(name)) and found[1] == path.name:
-            with contextlib.suppress(FileNotFoundError):
-                if time.time() - path.with_name(name).stat().st_mtime > _STALE:
-                    path.with_name(name).unlink()
 
 
 @contextlib.contextmanager
@@ -110,9 +105,8 @@ def read_json(path: Path, what: str) -> Any:
     except FileNotFoundError:
         raise ValueError(f"{path} does not exist: {what} is missing there") from None
     except (OSError, ValueError) as error:  # also: a folder, invalid UTF-8, numbers of 5000 digits
-        raise ValueError(
-            f"{path} is not valid JSON ({brief(error)}): {what} is damaged, or this is another file"
-        ) from None
+        why = f"{what} is damaged, or this is another file"
+        raise ValueError(f"{path} is not valid JSON ({brief(error)}): {why}") from None
     if isinstance(value, dict) and SEAL in value and value.pop(SEAL) != digest(value):
         how = f"{what} was damaged or edited (or delete the entry {SEAL!r})"
         raise ValueError(f"{path} does not match its digest: {how}")

@@ -14,7 +14,6 @@ from types import FrameType
 import torch
 
 from mvitac.data.pack import Pack
-from mvitac.methods.base import Method
 from mvitac.model import Model
 from mvitac.run import Run
 from mvitac.system.distributed import join
@@ -121,8 +120,9 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
             stop = stop_requested() if world.size == 1 else report and world.any(stop_requested())
             save = last or done % save_every == 0 or stop
             evaluate = last or (run.eval_every > 0 and done % run.eval_every == 0)
-            if save or evaluate:
-                _check_weights(method, done, run)
+            # Before weights are saved: a step may make them infinite although its own loss was finite.
+            if (save or evaluate) and not torch.stack([each.isfinite().all() for each in method.parameters()]).all():
+                raise _diverged(f"weights are not finite after step {done}", run)
 
             # Evaluate on held-out groups (split val).
             if log:
@@ -152,12 +152,6 @@ def _check_finite(losses: dict[str, float], step: int, run: Run) -> None:
     if not all(math.isfinite(value) for value in losses.values()):
         values = ", ".join(f"{name} {value:.4g}" for name, value in losses.items())
         raise _diverged(f"the loss is not finite at step {step} ({values})", run)
-
-
-def _check_weights(method: Method, step: int, run: Run) -> None:
-    """Check the weights before they are saved: a step may make them infinite although its own loss was finite."""
-    if not torch.stack([weights.isfinite().all() for weights in method.parameters()]).all():
-        raise _diverged(f"weights are not finite after step {step}", run)
 
 
 def _diverged(what: str, run: Run) -> Diverged:

@@ -207,5 +207,7 @@ def parse(text: str) -> Adapter:
     if not kind or not place:
         raise unknown("encoder", text, [f"{START}timm/NAME", f"{START}python:MODULE:FUNCTION"])
     given: dict[str, Any] = {key.replace("-", "_"): value for key, _, value in (pair.partition("=") for pair in pairs)}
+    if len(given) < len(pairs):
+        raise ValueError(f"{text}: an option is given twice")
     numbers = {key: int(given[key]) for key in ("size", "seed") if given.get(key, "").isdecimal()}
     return from_json(kind, {**given, **numbers, "place": place}, START + name)

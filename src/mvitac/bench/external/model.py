@@ -182,9 +182,8 @@ class ExternalModel(Model):
             raise ValueError(f"{self.text} fails on {len(images)} images of {modality} ({brief(error)})") from None
         if not torch.isfinite(found).all():
             raise ValueError(f"{self.text} gives NaN or infinite features of {modality}: check weights, mean and std")
-        if (
-            not (found == 0).all() and not 1e-3 < found.abs().max() < 1e12
-        ):  # float32 must hold the squares of the smaller ones
+        # float32 must hold the squares of the smaller ones.
+        if not (found == 0).all() and not 1e-3 < found.abs().max() < 1e12:
             largest = f"features of {modality} up to {found.abs().max():.0e}"
             raise ValueError(f"{self.text} gives {largest}: scale them to about 1")
         if not self.training and len(images) > 2 and modality not in self.alone:

@@ -10,8 +10,9 @@ named by their path below it. Attributes of the group, and of the groups above i
 has all episodes in one group, and their ends (exclusive) in meta/episode_ends.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import accumulate
+from math import prod
 from operator import getitem
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,7 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
     rows: list[dict[str, str]] = []
     found: Refs = {}
     left_out: LeftOut = {}
+    notes: dict[str, None] = {}
     seen = ""
     for file in files:
         with open_arrays(file) as opened:
@@ -56,6 +58,7 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
                 num = len(next(iter(refs.values())))
                 cells = _constants(opened, name, vectors)
                 cells |= _columns(demo, datasets, num, refs, vectors, left_out)
+                notes |= dict.fromkeys(_unwritten(file, {n: d for n, d in datasets.items() if n in {**refs, **cells}}))
                 episodes = _episodes(demo, everything.get("meta/episode_ends"), num)
                 for column in {**found, **refs}:
                     found.setdefault(column, [None] * len(rows)).extend(refs.get(column, [None] * num))
@@ -66,7 +69,7 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
     if missing := [name for name in images if name not in found]:
         raise _no_images(path, missing, seen)
     rows = [{name: cell for name, cell in row.items() if name not in left_out} for row in rows]
-    return Manifest.of(path, rows, found, group="demo", left_out=left_out)
+    return Manifest.of(path, rows, found, group="demo", left_out=left_out, notes=tuple(notes))
 
 
 def _datasets(group: Any) -> dict[str, Any]:
@@ -93,6 +96,24 @@ def _datasets(group: Any) -> dict[str, Any]:
         if data.external or data.is_virtual:
             raise ValueError(f"{group.file.filename}: {path} shows the content of other files: copy it into this one")
     return found
+
+
+def _unwritten(file: Path, datasets: dict[str, Any]) -> Iterator[str]:
+    """A note on each dataset of which parts were never written, or are lost."""
+    for data in datasets.values():
+        if 0 in (data.chunks or ()):
+            continue
+        if hasattr(data, "nchunks_initialized"):  # zarr
+            num, there = data.nchunks, data.nchunks_initialized
+        elif data.chunks:
+            num, there = (
+                prod(-(-side // of) for side, of in zip(data.shape, data.chunks, strict=True)),
+                data.id.get_num_chunks(),
+            )
+        else:
+            num, there = 1, int(data.id.get_storage_size() > 0 or not data.size)
+        if there < num:
+            yield f"{file.name}: {num - there} of {num} chunks of {data.name} are not there and read as its fill value"
 
 
 def _demonstrations(file: Path, datasets: dict[str, Any], images: Collection[str]) -> list[str]:

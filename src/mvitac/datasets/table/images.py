@@ -168,7 +168,14 @@ def read_rows(rows: Sequence[Row], size: int) -> list[Sample | Lost]:
     samples: list[Sample | Lost] = []
     for row in rows:
         try:
-            samples.append(_sample(row, vision, touch, size, lost))
+            for ref in (row.vision, *row.touch):
+                if ref in lost:
+                    raise ValueError(lost[ref])
+            pressed = [images[ref] for images, ref in zip(touch, row.touch, strict=False)]
+            for k, background in enumerate(row.background):
+                pressed[k] = difference(pressed[k], fit(mean_image(background), size))
+            both = np.concatenate(pressed, axis=2) if pressed else None
+            samples.append(Sample(vision=vision[row.vision] if row.vision else None, touch=both, columns=row.columns))
         except (ValueError, OSError) as error:
             if len(rows) == 1:
                 raise
@@ -179,15 +186,3 @@ def read_rows(rows: Sequence[Row], size: int) -> list[Sample | Lost]:
 def _load(refs: Sequence[ImageRef], size: int, lost: Damage) -> Loaded:
     """Read images at the stored size (a whole video would not fit otherwise); damaged ones are put in ``lost``."""
     return {ref: shrink(image, size) for ref, image in read_all(refs, lost)}
-
-
-def _sample(row: Row, vision: Loaded, touch: Sequence[Loaded], size: int, lost: Damage) -> Sample:
-    """Make the sample of ``row`` from the loaded images; ValueError if one of them is damaged."""
-    for ref in (row.vision, *row.touch):
-        if ref in lost:
-            raise ValueError(lost[ref])
-    pressed = [images[ref] for images, ref in zip(touch, row.touch, strict=False)]
-    for k, background in enumerate(row.background):
-        pressed[k] = difference(pressed[k], fit(mean_image(background), size))
-    image = vision[row.vision] if row.vision else None
-    return Sample(vision=image, touch=np.concatenate(pressed, axis=2) if pressed else None, columns=row.columns)

@@ -64,20 +64,18 @@ def read_lists(folder: Path) -> list[Frame]:
     for name in LIST_FILES:
         if not (folder / name).is_file():
             raise ValueError(f"{folder} has no {name}: the lists are in {AT} (--data.lists)")
-        _add_list(known, folder / name, name.split(".")[0].removesuffix("_rough"), "rough" in name)
+        split, rough = name.split(".")[0].removesuffix("_rough"), "rough" in name
+        for recording, number, label in read_list(folder / name, 2 if rough else len(CLASSES)):
+            frame = known.setdefault((recording, number), Frame(recording, number))
+            if frame.listed_rough if rough else frame.listed:
+                where = f"{folder / name}: {recording}/{number:010d}.jpg"
+                raise ValueError(f"{where} is listed twice: fetch the lists again")
+            if rough:
+                frame.listed_rough, frame.rough = split, label
+            else:
+                frame.listed, frame.category = split, label
     labelled = [frame for frame in known.values() if frame.category >= 0 or frame.rough >= 0]
     return sorted(labelled, key=lambda frame: (frame.recording, frame.number))
-
-
-def _add_list(known: dict[tuple[str, int], Frame], file: Path, split: str, rough: bool) -> None:
-    for recording, number, label in read_list(file, 2 if rough else len(CLASSES)):
-        frame = known.setdefault((recording, number), Frame(recording, number))
-        if frame.listed_rough if rough else frame.listed:
-            raise ValueError(f"{file}: {recording}/{number:010d}.jpg is listed twice: fetch the lists again")
-        if rough:
-            frame.listed_rough, frame.rough = split, label
-        else:
-            frame.listed, frame.category = split, label
 
 
 def find_touches(listed: Sequence[Frame]) -> None:
