@@ -22,8 +22,8 @@ class _Options:
     """FILE.py:function of an observation, or the folder of a LeRobot policy. In episodes of a suite also an encoder, or
     "pixels": it learns the task as the suite's rows do."""
     data: Path
-    """Folder of a pack: its groups are the episodes, and its values "action" what was demonstrated. Or a suite, a task and
-    a condition for a closed loop: "insert-v1/both/30", "servo-v1/corner/known sensor"."""
+    """Folder of a pack: its touch groups are the episodes, and its values "action" what was demonstrated. Or a suite, a
+    task and a condition for a closed loop: "insert-v1/both/30", "servo-v1/corner/known sensor"."""
     out: Path | None = None
     """Of a suite, also write a film (.webp) of its first episode, with its own and with another's touch."""
     json: Path | None = None
