@@ -106,11 +106,22 @@ def test_a_locked_trunk_sees_each_whole_image_once(
     once = train_twice(run, tmp_path, cut=3)
     mvitac.probe(once, tasks=("bright",), controls=False)
     assert seen.count("vision") == 1
-    monkeypatch.setattr(setup, "is_locked", lambda trunk: False)
+    monkeypatch.setattr(setup, "_once", lambda *_: False)
     train(run, tmp_path / "seen", quiet=True, validate=False)
     first, second = weights(once), weights(tmp_path / "seen")
     for parameter, value in first.items():
         torch.testing.assert_close(value, second[parameter], rtol=1e-3, atol=1e-4, msg=parameter)
+
+
+def test_precision_is_measured_on_what_a_step_computes(pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The features of a locked trunk are there already; eight small images take other kernels than a batch."""
+    run, seen = recipe("locked", pack), []
+    made = build_trunk(EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH), 3)
+    made.register_forward_pre_hook(lambda _, args: seen.append(args[0].shape))
+    built: list[str] = []
+    monkeypatch.setattr(setup, "build_trunk", lambda config, *_: (built.append(config.trunk), made)[1])
+    setup._trial_pass(run, pack, torch.device("cpu"))()
+    assert built == [run.encoder.touch.trunk] and seen == [(32, 3, 48, 48)]
 
 
 def test_features_of_all_stages() -> None:

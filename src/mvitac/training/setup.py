@@ -30,7 +30,7 @@ from mvitac.evaluation.leaks import (
 from mvitac.evaluation.sensors import sensors_of
 from mvitac.methods.base import Method
 from mvitac.model import Model, load
-from mvitac.nn.encoders import IMAGENET, SCRATCH, build_trunk, is_locked
+from mvitac.nn.encoders import IMAGENET, SCRATCH, build_trunk
 from mvitac.nn.imagenet import source
 from mvitac.registry import to_json
 from mvitac.run import Run, load_run, precision_of
@@ -191,12 +191,14 @@ def _hardware(run: Run, pack: Pack, device: torch.device, world: World, begun: P
 
 
 def _trial_pass(run: Run, pack: Pack, device: torch.device) -> Callable[[], None]:
-    """One pass, forward and backward, of the trunks of ``run`` with random weights, on a few images of its size."""
+    """One pass, forward and backward, of the trunks of a step with random weights, on some images of its size."""
     networks, spec = [], pack.spec
     with torch.random.fork_rng(devices=[]):
-        for m in spec.modalities:
+        for m in [m for m in spec.modalities if not _once(run, m)] or spec.modalities:
             trunk = build_trunk(replace(run.encoder[m], weights=SCRATCH), spec.channels(m), spec.frames(m)).to(device)
-            images = torch.rand(8, spec.channels(m), *[run.augment.size_of(m)] * 2, device=device)
+            size = run.augment.size_of(m)
+            num = max(8, min(run.batch_size, 150_000 // size**2))  # few small images take other kernels than a batch
+            images = torch.rand(num, spec.channels(m), size, size, device=device)
             trunk.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
             networks.append((trunk, images.to(memory_format=torch.channels_last)))
 
@@ -240,11 +242,16 @@ def _build_method(
     return method, taken
 
 
+def _once(run: Run, modality: str) -> bool:
+    """Whether features of ``modality`` are computed once: by a locked trunk, of images that do not vary."""
+    return run.encoder[modality].locked and run.augment.of(modality).fixed and not run.method.needs_vit
+
+
 def _locked_features(run: Run, pack: Pack, method: Method, world: World) -> dict[str, Tensor]:
     """Modality -> features [pack.num, D] of locked trunks, of whole images, from the cache that probes read, too."""
     model, found = Model(method, run, pack.spec, pack.size), {}
     for m, trunk in method.encoders().items():
-        if is_locked(trunk) and run.augment.of(m).fixed and not run.method.needs_vit:
+        if _once(run, m):
             rows = np.flatnonzero(pack.has(m))
             known = torch.from_numpy(_main_process_first(lambda m=m, rows=rows: features(model, pack, m, rows), world))
             found[m] = torch.zeros(pack.num, known.shape[1]).index_put((torch.from_numpy(rows),), known)
