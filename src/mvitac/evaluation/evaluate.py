@@ -15,7 +15,7 @@ from mvitac.evaluation.controls import CONTROLS, Records, controls_of, frozen_tr
 from mvitac.evaluation.encoders import Bound, open_encoders, probe_encoders
 from mvitac.evaluation.features import fitting
 from mvitac.evaluation.folds import fold_splits
-from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, mark_split_leaks, read_sources
+from mvitac.evaluation.leaks import CHOSE, UNKNOWN, Scored, Source, leaks_of, mark_split_leaks, read_sources
 from mvitac.evaluation.probe import probe_model, probes_of, seen_by, split_rows
 from mvitac.evaluation.probe_config import ProbeConfig
 from mvitac.evaluation.retrieval import cross_modal, retrieved_rows
@@ -267,8 +267,8 @@ def check_unseen(
     for path in paths:
         digest = (load_run(path)[1] if (path / "run.json").exists() else {}).get("pack")
         sources.append(learned := read_sources(path, weights))
-        own = 1 + (weights == "best") if digest == pack.digest else 0
-        refused = [] if allow_leak else (learned or [])[own:]
+        own = 1 + any(source.name.endswith(CHOSE) for source in (learned or [])[1:2])  # the run's own rows
+        refused = [] if allow_leak else (learned or [])[own if digest == pack.digest else 0 :]
         for task in tasks if refused else ():
             if (leak := scored.leak(refused, split_rows(pack, task).test)) not in ("", UNKNOWN):
                 seen = f"{path} has seen what {pack.path} would score, task {task.name!r}: {leak}"

@@ -11,10 +11,12 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 
 def folded(network: nn.Module) -> nn.Module:
-    """A copy of ``network``, in eval mode, without the BatchNorms that follow a convolution in the order of its modules.
+    """A copy of ``network``, which is in eval mode, without the BatchNorms that follow a convolution in the order of its modules.
 
     The network may call them in another order: compare the features of both.
     """
+    if not any(isinstance(module, nn.BatchNorm2d) for module in network.modules()):
+        return network
     network = copy.deepcopy(network)
     for parent in [*network.modules()]:
         for (first, conv), (second, norm) in pairwise([*parent.named_children()]):

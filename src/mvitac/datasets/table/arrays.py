@@ -68,8 +68,10 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
             seen = _seen(everything)
     if missing := [name for name in images if name not in found]:
         raise _no_images(path, missing, seen)
+    if len(said := [*notes]) > 3:
+        said[3:] = [f"the same of {len(said) - 3} more datasets"]
     rows = [{name: cell for name, cell in row.items() if name not in left_out} for row in rows]
-    return Manifest.of(path, rows, found, group="demo", left_out=left_out, notes=tuple(notes))
+    return Manifest.of(path, rows, found, group="demo", left_out=left_out, notes=tuple(said))
 
 
 def _datasets(group: Any) -> dict[str, Any]:
