@@ -11,9 +11,9 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 
 def folded(network: nn.Module) -> nn.Module:
-    """A copy of ``network``, which is in eval mode, without the BatchNorms that follow a convolution in the order of its modules.
+    """A copy of ``network``, which is in eval mode, without the BatchNorms that follow a convolution.
 
-    The network may call them in another order: compare the features of both.
+    What follows is read from the order of its modules. It may call them in another: compare the features of both.
     """
     if not any(isinstance(module, nn.BatchNorm2d) for module in network.modules()):
         return network
