@@ -2,6 +2,7 @@
 
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +91,8 @@ def test_lerobot_of_version_2_has_a_file_per_episode(tmp_path: Path) -> None:
     (root / "meta/info.json").write_text(json.dumps(info))
     tasks = [json.dumps({"task_index": k, "task": name}) for k, name in enumerate(("press", "slide"))]
     (root / "meta/tasks.jsonl").write_text("\n".join(tasks))
+    lengths = [json.dumps({"episode_index": e, "length": 8}) for e in range(4)]
+    (root / "meta/episodes.jsonl").write_text("\n".join(lengths))
     for e in range(4):
         chunk, name = f"chunk-{e // 2:03d}", f"episode_{e:06d}"
         for which, key in enumerate((FRONT, GEL)):
@@ -173,6 +176,53 @@ def test_lerobot_says_what_is_missing(tmp_path: Path) -> None:
     refused(root, r"file-001\.mp4 is missing: fetch the videos too")
     (root / "data/chunk-000/file-001.parquet").write_text("no")
     refused(root, r"file-001\.parquet cannot be read as a table")
+
+
+def changed(
+    root: Path, change: Callable[[dict[str, Any]], dict[str, Any]], file: str = "data/chunk-000/file-000"
+) -> Path:
+    """``root`` with every row of a table changed."""
+    path = root / f"{file}.parquet"
+    pq.write_table(pa.Table.from_pylist([change(row) for row in pq.read_table(path).to_pylist()]), path)
+    return root
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"timestamp": 0.0}, r"episode 0, frame 1: timestamp 0\S* does not rise"),
+        ({"timestamp": float("nan")}, r"data: timestamp of row 1 is ''"),
+        ({"frame_index": 3}, r"episode 0, frame 3: frame_index 3 does not rise"),
+        ({"episode_index": 7}, r"episode 7 has 12 rows, meta/episodes says nothing"),
+        ({"episode_index": 2}, r"episode 2, frame 0: frame_index 0 does not rise"),
+        ({"task_index": 5}, r"meta/tasks has no task_index 5"),
+    ],
+)
+def test_lerobot_refuses_rows_that_contradict_the_description(
+    tmp_path: Path, change: dict[str, Any], says: str
+) -> None:
+    """A constant clock paired every row with the first image; a cut table made a smaller pack."""
+    root = changed(make_lerobot(tmp_path / "set"), lambda row: row | change)
+    with pytest.raises(ValueError, match=says):
+        LeRobotConfig(path=root, labels=("kind",)).source()
+
+
+def test_lerobot_says_when_there_is_less_than_was_recorded(tmp_path: Path) -> None:
+    root = make_lerobot(tmp_path / "set")
+    (file := root / "meta/info.json").write_text(json.dumps(json.loads(file.read_text()) | {"total_frames": 30}))
+    changed(root, lambda row: row | {"length": LENGTHS[row["episode_index"]]}, "meta/episodes/chunk-000/file-000")
+    assert not LeRobotConfig(path=root, labels=("kind",)).manifest().notes
+    table = root / "data/chunk-000/file-001.parquet"
+    rows = pq.read_table(table).to_pylist()
+    pq.write_table(pa.Table.from_pylist(rows[:-2]), table)
+    with pytest.raises(ValueError, match="episode 2 has 8 rows, meta/episodes says 10"):
+        LeRobotConfig(path=root, labels=("kind",)).source()
+    pq.write_table(pa.Table.from_pylist(rows[:8]), table)  # a dataset that was fetched in part
+    spec = packed(LeRobotConfig(path=root, size=16), tmp_path / "pack").spec
+    assert "meta/info.json counts 30 frames, 20 are here" in spec.notes
+    (root / "meta/tasks.jsonl").write_text('{"task_index": 0, "task": "press"}\n{"task_index": 0, "task": "slide"}')
+    with pytest.raises(ValueError, match="a task_index with two texts"):
+        LeRobotConfig(path=root, labels=("kind",)).source()
 
 
 def measured(pack: Pack) -> tuple[np.ndarray, np.ndarray]:

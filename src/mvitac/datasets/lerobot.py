@@ -15,6 +15,7 @@ used, so cameras may have different rates. If it is farther away than ``toleranc
 """
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +28,7 @@ import pyarrow.parquet as pq
 from mvitac.data.video import frame_times
 from mvitac.datasets.table.clocks import nearest
 from mvitac.datasets.table.image_refs import Frame, ImageRef
-from mvitac.datasets.table.manifest import Manifest, Row
+from mvitac.datasets.table.manifest import Manifest, Row, number_of
 from mvitac.datasets.table.parquet import Refs, add_file
 from mvitac.datasets.table.table import RecordedConfig
 from mvitac.registry import unknown
@@ -64,30 +65,39 @@ class LeRobotConfig(RecordedConfig):
         cameras = [key for key, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
         names = choose(cameras, self.vision, self.touch, self.path)
         embedded = [key for key in names.values() if info["features"][key]["dtype"] == "image"]
-        rows, cells = self._table(embedded)
+        episodes = _episodes(self.path, info)
+        rows, cells, notes = self._table(info, episodes, embedded)
         found: Refs = {}
         for column, key in names.items():
-            found[column] = cells[key] if key in cells else self._in_videos(info, key, rows)
-        return Manifest.of(self.path, rows, found)
+            found[column] = cells[key] if key in cells else self._in_videos(info, key, rows, episodes)
+        return Manifest.of(self.path, rows, found, notes=notes)
 
-    def _table(self, embedded: Sequence[str]) -> tuple[list[Row], Refs]:
-        """Return the table rows as text, and the references of ``embedded`` images."""
+    def _table(
+        self, info: dict[str, Any], episodes: dict[str, dict[str, Any]], embedded: Sequence[str]
+    ) -> tuple[list[Row], Refs, tuple[str, ...]]:
+        """Return the table rows as text, the references of ``embedded`` images, and a note if rows are lacking."""
         tasks, rows, cells = _tasks(self.path), list[Row](), Refs()
         for file in sorted((self.path / "data").glob("*/*.parquet")):
             add_file(file, rows, cells, self.vectors(), embedded)
         for name in ("timestamp", "episode_index", "frame_index", *embedded):
             if name not in ({**rows[0], **cells} if rows else {}):
                 raise ValueError(f"{self.path / 'data'} has no column {name!r}: fetch the whole dataset")
+        _check(self.path, rows, episodes)
         kept = [i for i, row in enumerate(rows) if int(row["frame_index"]) % (self.every or 1) == 0]
         named = [{RENAMED.get(name, name): cell for name, cell in rows[i].items()} for i in kept]
-        for row in named if "task_index" in rows[0] else ():
-            row["task"] = tasks.get(row["task_index"], "")
-        return named, {key: [refs[i] for i in kept] for key, refs in cells.items()}
+        for row in named if tasks and "task_index" in rows[0] else ():
+            if row["task_index"] not in tasks:
+                raise ValueError(f"{self.path}: meta/tasks has no task_index {row['task_index']}: fetch it again")
+            row["task"] = tasks[row["task_index"]]
+        few = f"meta/info.json counts {info.get('total_frames')} frames, {len(rows)} are here"
+        notes = (few,) if info.get("total_frames", len(rows)) != len(rows) else ()
+        return named, {key: [refs[i] for i in kept] for key, refs in cells.items()}, notes
 
-    def _in_videos(self, info: dict[str, Any], key: str, rows: Sequence[dict[str, str]]) -> list[ImageRef | None]:
+    def _in_videos(
+        self, info: dict[str, Any], key: str, rows: Sequence[Row], episodes: dict[str, dict[str, Any]]
+    ) -> list[ImageRef | None]:
         """Return the frame of camera ``key`` at each row's time; None if no frame is near enough."""
-        is_new = str(info["codebase_version"]).startswith("v3")
-        episodes = _episodes(self.path / "meta" / "episodes") if is_new else {}
+        is_new = _is_new(info)
         wanted: dict[str, list[int]] = {}
         for i, row in enumerate(rows):
             wanted.setdefault(row["episode"], []).append(i)
@@ -151,22 +161,70 @@ def _info(root: Path) -> dict[str, Any]:
     return info
 
 
-def _episodes(folder: Path) -> dict[str, dict[str, Any]]:
-    table = _read(folder)
-    names = [name for name in table.column_names if name == "episode_index" or name.startswith("videos/")]
-    return {str(episode["episode_index"]): episode for episode in table.select(names).to_pylist()}
+def _is_new(info: dict[str, Any]) -> bool:
+    return str(info["codebase_version"]).startswith("v3")
+
+
+def _episodes(root: Path, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return what meta/episodes says of each episode; nothing if version 2 lacks the file."""
+    if _is_new(info):
+        table = _read(root / "meta" / "episodes")
+        names = [
+            name for name in table.column_names if name in ("episode_index", "length") or name.startswith("videos/")
+        ]
+        found = table.select(names).to_pylist()
+    else:
+        found = _lines(root / "meta" / "episodes.jsonl", "episode_index")
+    return {str(episode["episode_index"]): episode for episode in found}
+
+
+def _check(root: Path, rows: Sequence[Row], episodes: dict[str, dict[str, Any]]) -> None:
+    """Raise ValueError unless frames and times rise in each episode, which has as many as meta/episodes says."""
+    number, frame, time = (_numbers(root, rows, name) for name in ("episode_index", "frame_index", "timestamp"))
+    order = np.lexsort((frame, number))
+    for name, values in (("frame_index", frame), ("timestamp", time)):
+        stands = (np.diff(values[order]) <= 0) & (np.diff(number[order]) == 0)
+        if stands.any():
+            row = rows[order[np.argmax(stands) + 1]]
+            where = f"{root / 'data'}: episode {row['episode_index']}, frame {row['frame_index']}"
+            raise ValueError(f"{where}: {name} {row[name]} does not rise: fetch it again, or write it again")
+    for name, num in Counter(row["episode_index"] for row in rows).items():
+        said = episodes.get(name, {}).get("length", num if name in episodes else "nothing")
+        if episodes and said != num:
+            raise ValueError(f"{root}: episode {name} has {num} rows, meta/episodes says {said}: fetch it again")
+
+
+def _numbers(root: Path, rows: Sequence[Row], name: str) -> np.ndarray:
+    values = np.array([number_of(row[name]) for row in rows], float)
+    if not np.isfinite(values).all():
+        i = int(np.argmin(np.isfinite(values)))
+        raise ValueError(
+            f"{root / 'data'}: {name} of row {i + 1} is {rows[i][name]!r}: fetch it again, or write it again"
+        )
+    return values
 
 
 def _tasks(root: Path) -> dict[str, str]:
     """Return the text of each task_index."""
-    file, lines = root / "meta" / "tasks.parquet", root / "meta" / "tasks.jsonl"
-    if lines.is_file():
-        return {str(task["task_index"]): task["task"] for task in map(parse_json, lines.read_text().splitlines())}
-    if not file.is_file():
-        return {}
-    table = _read(file)
-    names = [name for name in table.column_names if name != "task_index"]
-    return dict(zip(map(str, table.column("task_index").to_pylist()), table.column(names[0]).to_pylist(), strict=True))
+    file = root / "meta" / "tasks.parquet"
+    pairs = [(str(t["task_index"]), t["task"]) for t in _lines(root / "meta" / "tasks.jsonl", "task_index", "task")]
+    if file.is_file() and not pairs:
+        table = _read(file)
+        names = [name for name in table.column_names if name != "task_index"]
+        pairs = [
+            *zip(map(str, table.column("task_index").to_pylist()), table.column(names[0]).to_pylist(), strict=True)
+        ]
+    if len(tasks := dict(pairs)) < len({*pairs}):
+        raise ValueError(f"{root}: meta/tasks has a task_index with two texts: fetch it again")
+    return tasks
+
+
+def _lines(path: Path, *names: str) -> list[dict[str, Any]]:
+    """Return the objects of a .jsonl file, which must have ``names``; none if there is no file."""
+    found = [*map(parse_json, path.read_text().splitlines())] if path.is_file() else []
+    if not all(isinstance(line, dict) and {*names} <= line.keys() for line in found):
+        raise ValueError(f"{path} has lines without {' or '.join(names)}: fetch it again")
+    return found
 
 
 def _read(path: Path) -> pa.Table:
