@@ -172,6 +172,11 @@ def own_times(name: str, *lines: object) -> Callable[[Path], None]:
         (spoil(36, stamp=lambda _: "then"), r"force\.csv, column stamp: 'then' is no time: give seconds"),
         (own_times("txt", *range(30), 20, *range(31, 50)), r"gel_timestamps\.txt: time 31 is before the one above it"),
         (own_times("txt", *range(49), float("nan")), r"gel_timestamps\.txt: 'nan' is no time"),
+        (own_times("csv", "time", *[1.5] * 50), r"gel_timestamps\.csv: all 50 times are 1\.5 s: a clock that stands"),
+        (
+            spoil(stamp=lambda _: "0.3"),
+            r"force\.csv, column stamp: all \d+ times are 0\.3 s: a clock that stands still",
+        ),
         (own_times("txt", *range(49)), r"gel_timestamps\.txt has 49 times, gel\.mp4 has 50 frames"),
     ],
 )
@@ -200,6 +205,16 @@ def test_logs_that_cannot_be_joined(tmp_path: Path, options: dict[str, Any], say
     write_csv(root / "0/back.csv", t=[0, 1, 0.4, 1.4], x=[0, 1, 2, 3])
     with pytest.raises(ValueError, match=says):
         packed(root, tmp_path / "p", **{**LOG, **options})
+
+
+def test_two_lists_of_times_are_one_too_many(tmp_path: Path) -> None:
+    root = recorded(tmp_path / "set", num=2)
+    own_times("txt", *(0.04 * i for i in range(50)))(root)
+    own_times("csv", "time", *(0.05 * i for i in range(50)))(root)
+    with pytest.raises(
+        ValueError, match=r"gel_timestamps\.txt and gel_timestamps\.csv both have the times of gel\.mp4"
+    ):
+        packed(root, tmp_path / "p", **LOG)
 
 
 def test_rows_with_one_stamp_are_counted(tmp_path: Path) -> None:

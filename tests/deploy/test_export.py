@@ -70,6 +70,18 @@ def int8(model: Model, onnx: Path, pack: Pack, tmp_path_factory: pytest.TempPath
     return out
 
 
+def test_where_8_bits_are_too_few_the_way_out_is_said(
+    model: Model, onnx: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exports, "quantise", lambda *_: None)
+    for precision, says in (
+        ("int8", r"\(min_cosine\); fp32 or bf16 may hold it"),
+        ("fp32", r"\(min_cosine\)$"),
+    ):
+        with copied(onnx), pytest.raises(ValueError, match=says):
+            export(model, pack, tmp_path / precision, ExportConfig(precision=precision, min_cosine=1.1))  # type: ignore
+
+
 @pytest.mark.parametrize("stored", [32, 45, 72])
 def test_the_resize_in_the_graph_is_the_probes_pixel_by_pixel(stored: int, model: Model) -> None:
     from mvitac.transforms.random_views import plain_view

@@ -442,6 +442,8 @@ def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys:
     assert touched[0]["touch"] == 1 and touched[0]["pattern"]["class"] in ("columns", "rows", "checks")
     assert [line["time"] for line in lines] == sorted({line["time"] for line in lines})
     assert main([*command, "--json", str(tmp_path)]) == 2 and "is a folder" in capsys.readouterr().err
+    for option in ("--seconds", "--stale"):
+        assert main([*command, option, "0"]) == 2 and f"{option[2:]} 0.0: give" in capsys.readouterr().err
     refused = ["--record", str(tmp_path / "r"), "--background", *[str(tmp_path / "touch" / "000.png")] * 2]
     assert main([*command, *refused]) == 2 and "2 background(s)" in capsys.readouterr().err
     assert not list(tmp_path.glob("r.*"))  # nothing is in the way of the next try

@@ -2,15 +2,14 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from tyro.conf import Positional
 
 from mvitac.cli.options import asks_help, parse, selectors
 from mvitac.datasets.base import DatasetConfig, dataset
-from mvitac.evaluation.diagnostics import mean_error
-from mvitac.evaluation.scores import each_score
+from mvitac.evaluation.intervals import MIN_GROUPS, num_groups_of, paired_difference
 from mvitac.experiments.finetune import FROZEN, TUNED, Finetuning
 from mvitac.experiments.finetune import finetune as run_finetune
 from mvitac.report.tables import print_finetuning
@@ -50,9 +49,19 @@ def finetune(argv: list[str]) -> None:
     result = run_finetune(*given, resume=options.resume, quiet=options.quiet)
     print_finetuning(result)
     print(f"scores: {options.out / 'scores.json'}")
-    last = [record for record in result["records"] if record["fraction"] == options.config.fractions[-1]]
-    tuned, frozen = (mean_error([each_score(r) for r in last if r["source"] == name]) for name in (TUNED, FROZEN))
-    if tuned < frozen:
-        print(f"next: mvitac publish {result['models'][-1]} ARTIFACT\n  (it fits probes of its own, on all labels)")
-    else:
-        print("fine-tuning gained nothing over the frozen probe: keep the model as it is, and publish or probe that")
+    print(next_step(result, options.config.fractions[-1]))
+
+
+def next_step(result: dict[str, Any], fraction: float) -> str:
+    """What to do with the models of ``fraction`` percent of the labels: publish them only if a gain is sure."""
+    last = [record for record in result["records"] if record["fraction"] == fraction]
+    if (num := min(map(num_groups_of, last))) < MIN_GROUPS:
+        by = result["group_by"]
+        return f"whether fine-tuning gained cannot be told with under {MIN_GROUPS} {by}s in test ({num}): label more of them"
+    gains = []
+    for task in dict.fromkeys(record["task"] for record in last):
+        ours, theirs = ([r for r in last if (r["task"], r["source"]) == (task, name)] for name in (TUNED, FROZEN))
+        gains.append(paired_difference(ours, theirs))
+    if any(low > 0 for _, low, *_ in gains) and not any(high < 0 for _, _, high, _ in gains):
+        return f"next: mvitac publish {result['models'][-1]} ARTIFACT\n  (it fits probes of its own, on all labels)"
+    return "no gain over the frozen probe is sure: keep the model as it is, and publish or probe that"

@@ -1,6 +1,7 @@
 """``mvitac live`` and ``predict``: answers from the frames of cameras and sensors, and from recordings."""
 
 import json
+import math
 import sys
 import threading
 import time
@@ -28,7 +29,7 @@ from mvitac.live.predictor import Live
 from mvitac.live.recorder import Recorder
 from mvitac.live.recordings import TOGETHER, Recordings, pack_tables
 from mvitac.live.streams import CaptureThread, Stream
-from mvitac.registry import to_json
+from mvitac.registry import check_range, to_json
 from mvitac.system.files import cache_dir, digest, write_atomic, write_json
 from mvitac.system.progress import shown, work
 
@@ -74,6 +75,9 @@ class _Options(_Common):
     """Write the summary to this file."""
     always: bool = False
     """Predict from every frame, in contact or not."""
+
+    def __post_init__(self) -> None:
+        check_range(self, 1e-3, math.inf, "stale", *(["seconds"] if self.seconds is not None else []))
 
 
 def live(argv: list[str]) -> None:

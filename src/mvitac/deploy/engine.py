@@ -115,7 +115,7 @@ class Engine:
         if images.keys() != self.inputs.keys():
             raise ValueError(f"this export takes {', '.join(self.inputs)}; got {', '.join(images) or 'nothing'}")
         for name, shape in self.inputs.items():
-            value = images[name]
+            value = images[name] = np.asarray(images[name])
             if value.dtype != np.uint8 or value.ndim != 4 or value.shape[1:] != shape:
                 raise ValueError(f"{name}: expected uint8 [B, {shape}], got {value.dtype} {value.shape}")
         if len(sizes := {len(value) for value in images.values()}) > 1 or 0 in sizes:

@@ -18,6 +18,8 @@ from scipy.special import expit, logit, stdtr, stdtrit
 
 from mvitac.evaluation.value_scores import r2_without_each_group
 
+MIN_GROUPS = 10  # with fewer groups, an interval over them says too little for a verdict
+
 
 def interval(records: Sequence[dict[str, Any]]) -> tuple[float, float, float]:
     """Mean accuracy (R2 of values) of ``records``, and the lower and upper end of its 95 % interval.

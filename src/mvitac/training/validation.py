@@ -19,13 +19,13 @@ from mvitac.data.several import MixedPack
 from mvitac.data.spec import AnyTask, Task
 from mvitac.evaluation import diagnostics
 from mvitac.evaluation.features import pack_features, sample
+from mvitac.evaluation.intervals import MIN_GROUPS
 from mvitac.model import BEST, Model
 from mvitac.run import Run
 from mvitac.training.log import Log
 from mvitac.training.setup import Setup
 
 NUM_EVAL_TRAIN, NUM_EVAL_VAL = 1024, 512
-MIN_GROUPS = 10  # with fewer groups in val, an interval over them says nothing
 Cells = dict[str, Tensor]
 """Task and modality -> [targets, groups, 2]: the sum of errors of each group, and that of a guess. A score is 1 - their
 ratio: accuracy of a class (errors: wrong rows; guess: all rows), R2 of a value (squared errors; those of the mean)."""

@@ -35,9 +35,12 @@ def times_of(video: Path) -> np.ndarray:
     """Return the times [N] of the frames in seconds: of the file VIDEO_timestamps.csv or .txt, else of the container."""
     times = frame_times(video)
     beside = [video.with_name(f"{video.stem}_timestamps{suffix}") for suffix in (".txt", *READERS)]
-    file = next((file for file in beside if file.is_file()), None)
-    if file is None:
+    found = [file for file in beside if file.is_file()]
+    if not found:
         return times
+    if len(found) > 1:
+        raise ValueError(f"{found[0]} and {found[1].name} both have the times of {video.name}: remove one")
+    file = found[0]
     if file.suffix == ".txt":
         stamps = seconds([line.strip() for line in file.read_text().splitlines() if line.strip()], file)
     else:
@@ -50,7 +53,16 @@ def times_of(video: Path) -> np.ndarray:
         raise ValueError(f"{file} has {len(stamps)} times, {video.name} has {len(times)} frames")
     if (np.diff(stamps) < 0).any():
         raise ValueError(f"{file}: time {np.argmax(np.diff(stamps) < 0) + 2} is before the one above it")
+    _check_moves(stamps, file)
     return stamps
+
+
+def _check_moves(stamps: np.ndarray, where: object) -> None:
+    """Raise ValueError if a clock stands still: everything would be joined to one image or measurement."""
+    if len(stamps) > 1 and np.ptp(stamps) == 0:
+        raise ValueError(
+            f"{where}: all {len(stamps)} times are {stamps[0]:.10g} s: a clock that stands still pairs nothing"
+        )
 
 
 def row_times(table: Manifest, column: str, refs: Sequence[ImageRef | None]) -> tuple[np.ndarray, list[str]]:
@@ -60,7 +72,9 @@ def row_times(table: Manifest, column: str, refs: Sequence[ImageRef | None]) -> 
     """
     recordings = [row.get(table.group or "", "") for row in table.rows]
     if name := next((name for name in (column, *STAMPS) if name in table.columns), None):
-        return seconds(table.filled(name, "time"), f"{table.path}, column {name}"), recordings
+        times = seconds(table.filled(name, "time"), where := f"{table.path}, column {name}")
+        _check_moves(times, where)
+        return times, recordings
     known: dict[str, np.ndarray] = {}
     times = np.full(len(refs), np.nan)
     for i, ref in enumerate(refs):
@@ -103,6 +117,7 @@ def join(
             log.check(column)
             _check_apart(file, times[at], [recordings[i] for i in at])
             stamps = seconds(log.filled(column, "time"), f"{file}, column {column}") + shift
+            _check_moves(stamps, f"{file}, column {column}")
             if len(back := np.flatnonzero(np.diff(stamps) < -0.1)) not in (0, len(stamps) - 1):  # s
                 where = f"{file}: the clock goes back after row {back[0] + 1}"
                 raise ValueError(f"{where}: mend it, or sort the rows by time")
