@@ -146,6 +146,21 @@ def test_int8_without_vnni_is_computed_by_onnxruntime(int8: Path, onnx: Path, mo
     assert used == ["_onnxruntime", "_openvino", "_openvino", "_openvino"]
 
 
+def test_int8_that_openvino_computes_wrongly_is_computed_by_onnxruntime(
+    model: Model, onnx: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As it does with means of a network's stages (memory that nobody wrote)."""
+    right = runtime._openvino
+    monkeypatch.setattr(runtime, "_has_vnni", lambda: True)
+    monkeypatch.setattr(runtime, "_openvino", lambda *a: lambda given: [-x for x in right(*a)(given)])
+    with copied(onnx):
+        export(model, pack, tmp_path / "x", ExportConfig(precision="int8", min_cosine=0.9, accuracy_loss=10))
+    assert json.loads((tmp_path / "x" / "export.json").read_text())["runtime"] == "onnxruntime"
+    Engine(tmp_path / "x")
+    with pytest.raises(ValueError, match="has cosine -"):
+        Engine(tmp_path / "x", engine="openvino")
+
+
 def open_int8(said: Path, folder: Path, ones: Path) -> None:
     Engine(folder, engine="openvino", threads=1)
     found = open_model(ones, "openvino")([np.ones((1, 64, 8, 8), np.float32)])[0]

@@ -56,7 +56,8 @@ class Engine:
 
         Args:
             folder: What ``mvitac export`` wrote.
-            engine: onnxruntime, openvino, or auto: OpenVINO where it is installed (for int8 only on a CPU with VNNI).
+            engine: onnxruntime, openvino, or auto: what its export found right, usually OpenVINO where it is installed (for
+                int8 only on a CPU with VNNI).
             threads: CPU threads, 0 = all cores.
 
         Raises:
@@ -87,6 +88,7 @@ class Engine:
         from_json(dict[str, tuple[_Target, ...]], self.values, "values")
         from_json(tuple[str, ...], self.sensors, "sensors")
         from_json(dict[str, str], self.crop, "crop")
+        engine = self.meta["runtime"] if engine == "auto" else engine
         self._call = open_model(self.folder / MODEL, engine, self.meta["precision"], threads)
 
     def _check(self) -> None:
