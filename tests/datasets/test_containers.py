@@ -170,7 +170,7 @@ def test_lerobot_says_what_is_missing(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
 
     refused(tmp_path / "nowhere", r"info\.json does not exist")
-    refused(make_lerobot(tmp_path / "old", version="v1.6"), r"version v1\.6: v2\.0 to v3\.0 are read")
+    refused(make_lerobot(tmp_path / "old", version="v1.6"), r"version v1\.6: v2 and v3 are read")
     root = make_lerobot(tmp_path / "set")
     (root / f"videos/{GEL}/chunk-000/file-001.mp4").unlink()
     refused(root, r"file-001\.mp4 is missing: fetch the videos too")
@@ -220,9 +220,30 @@ def test_lerobot_says_when_there_is_less_than_was_recorded(tmp_path: Path) -> No
     pq.write_table(pa.Table.from_pylist(rows[:8]), table)  # a dataset that was fetched in part
     spec = packed(LeRobotConfig(path=root, size=16), tmp_path / "pack").spec
     assert "meta/info.json counts 30 frames, 20 are here" in spec.notes
-    (root / "meta/tasks.jsonl").write_text('{"task_index": 0, "task": "press"}\n{"task_index": 0, "task": "slide"}')
+    changed(root, lambda row: row | {"task_index": 0}, "meta/tasks")
     with pytest.raises(ValueError, match="a task_index with two texts"):
         LeRobotConfig(path=root, labels=("kind",)).source()
+    pq.write_table(pa.table({"task_index": [0, 1]}), root / "meta/tasks.parquet")
+    with pytest.raises(ValueError, match=r"tasks\.parquet is damaged"):
+        LeRobotConfig(path=root, labels=("kind",)).source()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (
+            {"from_timestamp": 0.0, "to_timestamp": 1.2, "file_index": 0},
+            r"episodes \d and \d share frames of .*file-000\.mp4",
+        ),
+        ({"from_timestamp": "soon"}, r"meta/episodes, observation\.images\.gelsight in episode 0, is damaged"),
+        ({"file_index": None}, r"meta/episodes, observation\.images\.gelsight in episode 0, is damaged"),
+    ],
+)
+def test_lerobot_checks_the_places_of_episodes(tmp_path: Path, change: dict[str, Any], says: str) -> None:
+    change = {f"videos/{GEL}/{name}": value for name, value in change.items()}
+    root = changed(make_lerobot(tmp_path / "set"), lambda row: row | change, "meta/episodes/chunk-000/file-000")
+    with pytest.raises(ValueError, match=says):
+        LeRobotConfig(path=root, size=16).source()
 
 
 def measured(pack: Pack) -> tuple[np.ndarray, np.ndarray]:

@@ -44,6 +44,7 @@ from mvitac.evaluation.leaks import (
 from mvitac.evaluation.score_text import with_interval
 from mvitac.evaluation.scores import pool, summarise
 from mvitac.nn.encoders import build_trunk
+from mvitac.nn.initial import Init
 from mvitac.report.report import write_report
 from mvitac.report.tables import unseen_groups
 from mvitac.system.files import read_json
@@ -175,6 +176,9 @@ def test_a_list_is_that_of_its_run_and_of_its_weights(pack: Pack, tmp_path: Path
     assert Scored(pack).leak(read_sources(tmp_path), val) == ""
     leak = f"{len(val)} of {len(val)} test rows and "
     assert (found := Scored(pack).leak(read_sources(tmp_path, "best"), val)).startswith(leak) and CHOSE in found
+    start = Init(path=tmp_path / "model.best.safetensors")
+    heir = train(replace(smoke(pack), steps=1, init=start), tmp_path / "heir", quiet=True)
+    assert CHOSE in Scored(pack).leak(read_sources(heir), val)
     write_sources(tmp_path, [source_of(pack, pack.rows("test"))])  # of a run that saw other rows
     with pytest.raises(ValueError, match="is of another run"):
         read_sources(tmp_path)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import signal
 import sys
 import threading
 import time
@@ -37,7 +38,8 @@ from mvitac.system.progress import shown, work
 @dataclass(frozen=True, kw_only=True)
 class _Common:
     model: Annotated[Positional[str], tyro.conf.arg(metavar="MODEL")]
-    """Folder of an export (fastest); or of a run or an artifact, or owner/name on the Hub, which is exported first."""
+    """Folder of an export (fastest); or of a run or an artifact, or owner/name on the Hub, which is exported first, if
+    the data that it was trained on is here (else: mvitac export --on PACK)."""
     vision: str | None = None
     """SOURCE of the camera. Of other data than recordings: the name of its images."""
     touch: tuple[str, ...] = ()
@@ -113,11 +115,12 @@ def live(argv: list[str]) -> None:
 
 
 def _run(loop: Live, seconds: float | None) -> None:
-    """Print every prediction and release until all streams ended, ``seconds`` are over, or Ctrl-C.
+    """Print every prediction and release until all streams ended, ``seconds`` are over, Ctrl-C or SIGTERM.
 
     Every stream is read in a thread of its own.
     """
     start, news = loop.clock(), threading.Event()
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: what was recorded becomes a pack
     threads = [CaptureThread(stream, news.set) for stream in loop.all]
     for thread in threads:
         thread.start()
@@ -136,6 +139,7 @@ def _run(loop: Live, seconds: float | None) -> None:
             thread.stopping.set()
         for thread in threads:
             thread.join(2.0)  # a device that hangs must not hang us
+        signal.signal(signal.SIGTERM, before)
     loop.finish()
 
 
@@ -170,7 +174,8 @@ def predict(argv: list[str]) -> None:
         raise ValueError(f"{options.model} has no probes of classes or values: export it on data that has labels")
     if config:
         pack = _opened(config, given, next(iter(engine.inputs.values()))[0])
-        _write(options.out, pack_tables(engine, pack), pack.num)
+        if num := pack.num - _write(options.out, pack_tables(engine, pack), pack.num):
+            _say(f"{num} of {pack.num} rows are left out: without an image that the model takes")
         return
     opened = dict.fromkeys(engine.inputs, single) if single else opened
     _say_uncropped(engine, dict.fromkeys(engine.inputs, (options.source,)) if single else given)
@@ -191,8 +196,8 @@ def _opened(config: Any, names: Mapping[str, Sequence[str]], side: int) -> Pack:
     return replace(config, size=side, **{name: value for name, value in given.items() if value}).open()
 
 
-def _write(out: Path, tables: Iterator[dict[str, Any]], num: int) -> None:
-    """Write ``tables``, of at most ``num`` rows in all, as CSV, and say how many there are and how fast they came."""
+def _write(out: Path, tables: Iterator[dict[str, Any]], num: int) -> int:
+    """Write ``tables``, of at most ``num`` rows in all, as CSV; say how fast they came, and return how many they were."""
     start, written = time.monotonic(), 0
 
     def write(file: Any) -> None:
@@ -209,6 +214,7 @@ def _write(out: Path, tables: Iterator[dict[str, Any]], num: int) -> None:
 
     write_atomic(out, write)
     _say(f"written: {out}, {written} frames, {written / (time.monotonic() - start):.0f} a second")
+    return written
 
 
 def sources(

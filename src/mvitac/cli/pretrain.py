@@ -31,7 +31,7 @@ class _Options:
 def pretrain(argv: list[str]) -> None:
     """mvitac pretrain --data D|--from run.json [--method M] [--recipe R] [--init RUN] [fields] --out DIR [--resume]"""
     chosen, rest = selectors(argv, ("--method", "--data", "--recipe", "--from", "--logger"))
-    base = _chosen_run(chosen, phased=False)
+    base = _chosen_run(chosen, rest, phased=False)
     if not asks_help(rest) and not {"--data", "--from"} & chosen.keys():
         names = "|".join(DatasetConfig.choices)
         raise ValueError(f"name the data: --data {names}, a path, or --from RUN.JSON; without any: mvitac demo")
@@ -50,7 +50,7 @@ def pretrain(argv: list[str]) -> None:
     if base.data.phased is None and "--from" not in chosen:  # the recipe depends on what the opened data says
         check_out(options.out, options.resume)
         pack = open_pack(options.run.data, join(), options.quiet)
-        options = parse(_Options, rest, "pretrain", default=replace(usual, run=_chosen_run(chosen, pack.phased)))
+        options = parse(_Options, rest, "pretrain", default=replace(usual, run=_chosen_run(chosen, rest, pack.phased)))
     with open_loggers(chosen.get("--logger"), options.out, options.run) as loggers:
         out = train(options.run, options.out, resume=options.resume, quiet=options.quiet, loggers=loggers, pack=pack)
     data = load_run(out)[1].get("data", {})
@@ -58,11 +58,16 @@ def pretrain(argv: list[str]) -> None:
     print(f"trained: {out}\nnext: mvitac {known} {out}")
 
 
-def _chosen_run(chosen: dict[str, str], phased: bool) -> Run:
+def _chosen_run(chosen: dict[str, str], rest: list[str], phased: bool) -> Run:
     """The run before single fields are changed: a recorded one, or a recipe with its data and method.
 
-    ``phased`` is for data that does not know it before it is opened.
+    ``phased`` is for data that does not know it before it is opened. ``--epochs`` in ``rest`` replaces the recipe's steps.
     """
+    run = _unchanged_run(chosen, phased)
+    return replace(run, steps=None) if any(word.split("=")[0] == "--epochs" for word in rest) else run
+
+
+def _unchanged_run(chosen: dict[str, str], phased: bool) -> Run:
     if "--from" in chosen:
         for name in ("--method", "--data", "--recipe"):
             if name in chosen:

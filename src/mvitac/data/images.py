@@ -150,6 +150,13 @@ def ros_pixels(message: Any, name: str) -> bytes | np.ndarray:
     if not channels:
         raise ValueError(f"{name} has the encoding {code}: {', '.join(ROS_CHANNELS)} are read")
     kind = kind.newbyteorder(">" if message.is_bigendian else "<")
+    if (
+        not message.height * message.width
+        or len(message.data) % message.height
+        or (len(message.data) < message.height * message.width * channels * kind.itemsize)
+    ):
+        size = f"{message.width} x {message.height} pixels of {code}"
+        raise ValueError(f"{name} has {len(message.data)} bytes for {size}: it is damaged")
     lines = np.frombuffer(message.data, kind).reshape(message.height, -1)[:, : message.width * channels]  # padded
     pixels = lines.reshape(message.height, message.width, channels)[:, :, :3]
     return pixels[:, :, ::-1] if code.startswith("bgr") else pixels

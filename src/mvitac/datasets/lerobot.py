@@ -18,6 +18,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -32,7 +33,7 @@ from mvitac.datasets.table.manifest import Manifest, Row, number_of
 from mvitac.datasets.table.parquet import Refs, add_file
 from mvitac.datasets.table.table import RecordedConfig
 from mvitac.registry import unknown
-from mvitac.system.files import brief, parse_json, read_json
+from mvitac.system.files import brief, fields_of, parse_json, read_json
 
 FELT = re.compile(r"touch|tactile|gelsight|digit(?!al)|gel\b|finger", re.IGNORECASE)  # usual names of tactile cameras
 RENAMED = {"episode_index": "episode", "frame_index": "frame", "index": "id"}
@@ -76,7 +77,7 @@ class LeRobotConfig(RecordedConfig):
         self, info: dict[str, Any], episodes: dict[str, dict[str, Any]], embedded: Sequence[str]
     ) -> tuple[list[Row], Refs, tuple[str, ...]]:
         """Return the table rows as text, the references of ``embedded`` images, and a note if rows are lacking."""
-        tasks, rows, cells = _tasks(self.path), list[Row](), Refs()
+        tasks, rows, cells = _tasks(self.path, info), list[Row](), Refs()
         for file in sorted((self.path / "data").glob("*/*.parquet")):
             add_file(file, rows, cells, self.vectors(), embedded)
         for name in ("timestamp", "episode_index", "frame_index", *embedded):
@@ -102,22 +103,27 @@ class LeRobotConfig(RecordedConfig):
         for i, row in enumerate(rows):
             wanted.setdefault(row["episode"], []).append(i)
         times: dict[Path, np.ndarray] = {}
+        used: dict[Path, list[tuple[float, float, str]]] = {}
         places: list[ImageRef | None] = [None] * len(rows)
         for name, numbers in wanted.items():
             number = int(name)
             episode = episodes.get(name, {}) if is_new else {f"videos/{key}/from_timestamp": 0.0}
             if episode.get(f"videos/{key}/from_timestamp") is None:
                 raise ValueError(f"{self.path}: meta/episodes has no entry for {key} in episode {name}")
+            where = f"{self.path}: meta/info.json or meta/episodes, {key} in episode {name},"
             place = {part: episode.get(f"videos/{key}/{part}") for part in ("chunk_index", "file_index")}
             place |= {"episode_index": number, "episode_chunk": number // info.get("chunks_size", 1000)}
-            file = self.path / info["video_path"].format(video_key=key, **place)
+            with fields_of(where):
+                file = self.path / info["video_path"].format(video_key=key, **place)
+                start, end = episode[f"videos/{key}/from_timestamp"], episode.get(f"videos/{key}/to_timestamp")
+                low, high = start - 1e-3, (np.inf if end is None else end) - 1e-3
+            used.setdefault(file, []).append((low, high, name))
             if file not in times:
                 if not file.is_file():
                     raise ValueError(f"{file} is missing: fetch the videos too, or leave {key} out")
                 times[file] = frame_times(file)
-            start, end = episode[f"videos/{key}/from_timestamp"], episode.get(f"videos/{key}/to_timestamp")
             # One file has several episodes: the nearest frame must be of the same episode.
-            low, high = np.searchsorted(times[file], [start - 1e-3, (np.inf if end is None else end) - 1e-3])
+            low, high = np.searchsorted(times[file], [low, high])
             when = start + np.array([float(rows[i]["timestamp"]) for i in numbers])
             at, away = nearest(times[file][low:high], when)
             for i, frame, miss, moment in zip(numbers, (low + at).tolist(), away.tolist(), when.tolist(), strict=True):
@@ -126,6 +132,12 @@ class LeRobotConfig(RecordedConfig):
                 elif not self.allow_missing:
                     far = f"{file}: no frame within {self.tolerance:g} s of {moment:.3f} s (episode {name}, the nearest is"
                     raise ValueError(f"{far} {miss:.3f} s away): --data.tolerance, or --data.allow-missing")
+        for file, parts in used.items():
+            for (_, end, one), (start, _, other) in pairwise(sorted(parts)):
+                if start < end - 2e-3:
+                    raise ValueError(
+                        f"{self.path}: by meta/episodes, episodes {one} and {other} share frames of {file}"
+                    )
         return places
 
 
@@ -154,8 +166,8 @@ def choose(cameras: Sequence[str], vision: str | None, touch: tuple[str, ...], w
 def _info(root: Path) -> dict[str, Any]:
     info = read_json(root / "meta" / "info.json", "a LeRobotDataset's description")
     version = str(info.get("codebase_version")) if isinstance(info, dict) else "none"
-    if not version.startswith(("v2", "v3")):
-        raise ValueError(f"{root} has LeRobotDataset version {version}: v2.0 to v3.0 are read")
+    if not version.startswith(("v2.", "v3.")):
+        raise ValueError(f"{root} has LeRobotDataset version {version}: v2 and v3 are read")
     if not isinstance(info.get("features"), dict) or not all("dtype" in f for f in info["features"].values()):
         raise ValueError(f"{root / 'meta/info.json'} lists no features: fetch it again")
     return info
@@ -204,16 +216,16 @@ def _numbers(root: Path, rows: Sequence[Row], name: str) -> np.ndarray:
     return values
 
 
-def _tasks(root: Path) -> dict[str, str]:
+def _tasks(root: Path, info: dict[str, Any]) -> dict[str, str]:
     """Return the text of each task_index."""
     file = root / "meta" / "tasks.parquet"
-    pairs = [(str(t["task_index"]), t["task"]) for t in _lines(root / "meta" / "tasks.jsonl", "task_index", "task")]
-    if file.is_file() and not pairs:
-        table = _read(file)
-        names = [name for name in table.column_names if name != "task_index"]
-        pairs = [
-            *zip(map(str, table.column("task_index").to_pylist()), table.column(names[0]).to_pylist(), strict=True)
-        ]
+    if not _is_new(info):
+        pairs = [(str(t["task_index"]), t["task"]) for t in _lines(root / "meta" / "tasks.jsonl", "task_index", "task")]
+    else:
+        table = _read(file) if file.is_file() else pa.table({"task_index": [], "task": []})
+        with fields_of(file):
+            text = next(name for name in (*table.column_names, "task") if name != "task_index")
+            pairs = [*zip(map(str, table["task_index"].to_pylist()), table[text].to_pylist(), strict=True)]
     if len(tasks := dict(pairs)) < len({*pairs}):
         raise ValueError(f"{root}: meta/tasks has a task_index with two texts: fetch it again")
     return tasks

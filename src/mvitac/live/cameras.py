@@ -200,6 +200,8 @@ MODE = re.compile(r"(?P<which>.+?)(@(?P<width>\d+)x(?P<height>\d+))?(@(?P<fps>\d
 def crop_of(text: str) -> tuple[str, tuple[int, ...]]:
     """A source's text without ``#x:y:width:height`` at its end, and these numbers; () = all of its images."""
     found = re.fullmatch(r"(.*)#(\d+):(\d+):([1-9]\d*):([1-9]\d*)", text)
+    if not found and re.search(r"#[^/]*:[^/]*$", text):
+        raise ValueError(f"source {text!r}: give the part as #x:y:width:height, in pixels")
     return (found[1], tuple(map(int, found.groups()[1:]))) if found else (text, ())
 
 
@@ -212,7 +214,9 @@ def source(text: str, modality: str) -> Source:
     text, crop = crop_of(text)
     mode = MODE.fullmatch(text)
     if text.partition(":")[0] == "sim":
-        found: Source = Simulated(modality, int(text.partition(":")[2] or 0))
+        if not (seed := text.removeprefix("sim").removeprefix(":") or "0").isdigit():
+            raise ValueError(f"source {text!r}: {seed!r} is no seed, a whole number from 0")
+        found: Source = Simulated(modality, int(seed))
     elif mode and (mode["which"].isdigit() or text.startswith(("/dev/", "serial:"))):
         if importlib.util.find_spec("cv2") is None:
             raise ValueError(f"source {text!r} needs OpenCV: pip install -e '.[live]' in mvitac's clone")
@@ -227,7 +231,11 @@ def source(text: str, modality: str) -> Source:
 def _place(text: str) -> tuple[Path, float]:
     """Path and rate of a video or folder[@fps]."""
     name, _, rate = text.rpartition("@")
-    return (Path(name), float(rate)) if name and Path(name).is_dir() else (Path(text), 30.0)
+    if not (name and Path(name).is_dir()):
+        return Path(text), 30.0
+    if not re.fullmatch(r"\d*\.?\d+", rate) or not float(rate):
+        raise ValueError(f"source {text!r}: {rate!r} is no frame rate")
+    return Path(name), float(rate)
 
 
 def is_recording(text: str) -> bool:
@@ -241,8 +249,6 @@ def recording(text: str) -> Recording:
     """The video file or the folder[@fps] that ``text`` names; ValueError if there is none, or it cannot be read."""
     text, crop = crop_of(text)
     path, fps = _place(text)
-    if not 0 < fps < float("inf"):
-        raise ValueError(f"source {text!r}: {fps} is no frame rate")
     if not (path.is_dir() or path.suffix.lower() in VIDEOS):
         raise ValueError(f"source {text!r}: give a video ({', '.join(VIDEOS)}), a folder[@fps], a camera or sim")
     files = Folder(path, fps) if path.is_dir() else Video(path)

@@ -108,7 +108,7 @@ class Recorded(Source):
 
     def spec(self) -> DataSpec:
         channels: Any = {f"{m}_channels": self.shapes.get(m, (0,))[-1] for m in ("vision", "touch")}
-        about: Any = {"name": "recording", "group_by": "contact", "source": "mvitac live", "tasks": ()}
+        about: Any = {"name": "recording", "group_by": "phase", "source": "mvitac live", "tasks": ()}
         return DataSpec(**about, **channels, licence="as the one who recorded it decides")
 
     def items(self) -> Sequence[str]:

@@ -49,6 +49,9 @@ def answers(engine: Engine, outputs: dict[str, np.ndarray]) -> Table:
 
 def pack_tables(engine: Engine, pack: Pack) -> Iterator[Table]:
     """Tables of the rows of a pack that have all images; ValueError if the model was trained on others."""
+    for modality in engine.inputs:
+        if modality not in pack.images:
+            raise ValueError(f"{pack.path} has no {modality}, which the model takes too")
     if pack.spec.difference != engine.difference:
         raise ValueError(f"{pack.path}: touch minus its background, in the model or in the pack only")
     if engine.window:

@@ -112,7 +112,8 @@ def _record(setup: Setup, asked: Run, out: Path, start: Start | None, taken: dic
     run, pack, val = setup.run, setup.pack, setup.pack.rows("val")
     before = [*(start.sources if start else []), *map(file_source, weights_files(run))]
     chose = [source_of(pack, val, CHOSE)] if len(val) else []
-    sources = with_ancestors(source_of(pack, setup.rows), [*chose, *before])
+    own, *others = with_ancestors(source_of(pack, setup.rows), before)
+    sources = [own, *chose, *others]
     if not (out / "run.json").exists():
         record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(setup.spec)}
         record |= {LEARNED: sources_digest(sources)}

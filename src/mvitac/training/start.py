@@ -1,6 +1,6 @@
 """Start weights from another model (``Run.init``): read them, load what fits, and say what that model learned from."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +8,16 @@ import numpy as np
 from torch import nn
 
 from mvitac.data.pack import Pack
-from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, file_source, read_sources, unknown_source, weights_files
+from mvitac.evaluation.leaks import (
+    CHOSE,
+    UNKNOWN,
+    Scored,
+    Source,
+    file_source,
+    read_sources,
+    unknown_source,
+    weights_files,
+)
 from mvitac.methods.base import Method
 from mvitac.model import BEST, load
 from mvitac.nn.encoders import within
@@ -41,6 +50,8 @@ def read_start(init: Init) -> Start | None:
     own = init.file.name.startswith("model.") and (folder / "run.json").exists()
     found = read_sources(folder, "best" if init.file.name == BEST else "last") if own else None
     learned = [unknown_source(folder.name if own else init.file.name)] if found is None else found
+    # Those that chose the best weights here taught whatever starts from them, its last weights, too.
+    learned = [replace(s, name=f"{s.name} of {folder.name}") if s.name.endswith(CHOSE) else s for s in learned]
     return Start(init, trunks, heads, model.run.encoder.named(model.encoders), learned, model.spec.sensors)
 
 
