@@ -191,7 +191,7 @@ def impossible(config: Any, start: str) -> Iterator[tuple[str, str]]:
             values.append("1" + "0" * 30)
         for value in values if not fixed else ():
             words = f"{value} {value}" if kind == tuple[float, float] else value
-            yield f"{start} --{name.replace('_', '-')} {words}{' --steps None' * (name == 'epochs')}", name
+            yield f"{start} --{name.replace('_', '-')} {words}", name
 
 
 FIELDS = [

@@ -12,6 +12,7 @@ from unittest.mock import Mock
 import pytest
 
 from mvitac.cli.main import COMMANDS, HELP, main
+from mvitac.cli.pretrain import _chosen_run
 from mvitac.data.pack import Pack
 from mvitac.datasets import DatasetConfig, dataset
 from mvitac.registry import default
@@ -142,3 +143,12 @@ def test_the_demo_starts_from_imagenet_where_its_weights_are(
     monkeypatch.setattr("mvitac.cli.demo.run_demo", lambda run, *_: made.append(run))
     assert main(["demo"]) == 0
     assert made[0].recipe == expected and ("from scratch" in capsys.readouterr().out) != bool(there)
+
+
+def test_epochs_replace_the_steps_of_a_recipe(pack: Pack) -> None:
+    chosen = {"--recipe": "smoke", "--data": str(pack.path)}
+    assert [_chosen_run(chosen, words, True).steps for words in ([], ["--epochs", "2"], ["--epochs=2"])] == [
+        8,
+        None,
+        None,
+    ]

@@ -8,6 +8,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from mvitac.data.build import build
+from mvitac.data.images import ros_pixels
 from mvitac.data.pack import Pack
 from mvitac.datasets.rosbag import RosbagConfig
 from support.ros import START, STORE, compressed, raw, stamped
@@ -85,6 +86,41 @@ def test_messages_received_in_the_same_moment_are_not_one(tmp_path: Path, plugin
         RosbagConfig(path=tmp_path / "bags", touch=("/none",)).source()
 
 
+@pytest.mark.parametrize(
+    ("gel", "front", "says"),
+    [
+        ([1.0] * 9, [1.0, 2.0], rf"topic {GEL}: all 9 times are .* a clock that stands still"),
+        ([1.0, 1.0, 2.0], [7.0, 8.0], rf"no image with all others within 0\.04 s: {GEL} \d+1\.000 to .*{FRONT}"),
+        ([], [], "bag is empty: leave it out"),
+        ([1.0, 1.0, 2.0], [1.0, 2.0], ""),
+    ],
+)
+def test_clocks_that_pair_nothing(tmp_path: Path, gel: list[float], front: list[float], says: str) -> None:
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        for topic, times in ((GEL, gel), (FRONT, front)):
+            to = bag.add_connection(topic, "sensor_msgs/msg/Image", typestore=STORE) if times else None
+            for i, time in enumerate(times):
+                message = raw(time, np.full((16, 20, 3), i, np.uint8), "rgb8")
+                bag.write(to, START * 10**9 + i, STORE.serialize_cdr(message, message.__msgtype__))  # type: ignore
+    config = RosbagConfig(path=tmp_path / "bag", touch=(GEL,), vision=FRONT, every=1, tolerance=0.04)
+    if says:
+        with pytest.raises(ValueError, match=says):
+            config.source()
+    else:
+        assert f"1 messages of {GEL} have the stamp of another" in config.manifest().notes[0]
+        (tmp_path / "bag" / "metadata.yaml").unlink()
+        with pytest.raises(ValueError, match=r"bag\.mcap has no metadata\.yaml \(a recording that was killed\)"):
+            RosbagConfig(path=tmp_path, touch=(GEL,)).source()
+
+
+def test_a_short_image_is_named(tmp_path: Path) -> None:
+    message = raw(0.0, np.zeros((16, 20, 3), np.uint8), "rgb8")
+    for data, height in ((message.data[:-40], 16), (message.data, 0), (message.data[:-128], 16)):
+        message.data, message.height = data, height
+        with pytest.raises(ValueError, match=rf"it has {len(data)} bytes for 20 x {height} pixels of rgb8"):
+            ros_pixels(message, "it")
+
+
 def test_depth_and_what_cannot_be(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", StoragePlugin.MCAP, 0, np.full((16, 20, 1), 900, np.uint16))
     scale = (f"{GEL}=0:1000", f"{FRONT}=0:1800")
@@ -94,9 +130,13 @@ def test_depth_and_what_cannot_be(tmp_path: Path) -> None:
     for options, says in (
         ({}, rf"has image topics {GEL}, {FRONT}: --data\.vision, --data\.touch TOPIC"),
         ({"touch": ("/digit/image",)}, rf"unknown topic '/digit/image': .*did you mean '{GEL}'"),
-        ({"touch": (GEL,), "values": (f"{WRENCH}.wrench.force.w:N",)}, "no field wrench.force.w: unknown field 'w'"),
+        (
+            {"touch": (GEL,), "values": (f"{WRENCH}.wrench.force.w:N",)},
+            f"bag, {WRENCH}: a message has no field wrench.force.w",
+        ),
         ({"touch": (GEL,), "values": (f"{WRENCH}.wrench.force.z[1]:N",)}, r"no field wrench\.force\.z\[1\]: unknown"),
         ({"touch": (GEL,), "values": ("/ft/wrong.x:N",)}, "unknown column '/ft/wrong.x'"),
+        ({"touch": (WRENCH,)}, f"{WRENCH} is of geometry_msgs/msg/WrenchStamped, no images"),
     ):
         with pytest.raises(ValueError, match=says):
             RosbagConfig(path=bag, **options).source()

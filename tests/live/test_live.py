@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shutil
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from mvitac.data.pack import Pack
 from mvitac.deploy.engine import Engine
 from mvitac.live.cameras import Camera, Ended, Folder, Simulated, source
 from mvitac.live.contact import Contact, LiveConfig
+from mvitac.live.predictor import Live
 from mvitac.live.recorder import Recorder, finish
 from mvitac.live.streams import Event, Stream
 from mvitac.model import Model
@@ -228,7 +230,12 @@ def test_sources_by_name(tmp_path: Path) -> None:
         seen.append(frame.image[0, 0, 0] if frame else None)
     assert seen == [0, 0, 20, 20] and stream.num_damaged == 1
     assert isinstance(source("sim:3", "vision"), Simulated)
-    for text, says in (("nothing", "'nothing': give a video"), ("sim:x", "'x'"), (f"{tmp_path}@fast", "'fast'")):
+    for text, says in (
+        ("nothing", "'nothing': give a video"),
+        ("sim:-3", "'-3' is no seed"),
+        (f"{tmp_path}@fast", "'fast' is no"),
+        ("0#0:0:-5:9", "give the part as"),
+    ):
         with pytest.raises(ValueError, match=says):
             source(text, "touch")
     missing = Stream("touch", source("97", "touch"), clock=Clock())
@@ -447,6 +454,23 @@ def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys:
     refused = ["--record", str(tmp_path / "r"), "--background", *[str(tmp_path / "touch" / "000.png")] * 2]
     assert main([*command, *refused]) == 2 and "2 background(s)" in capsys.readouterr().err
     assert not list(tmp_path.glob("r.*"))  # nothing is in the way of the next try
+
+
+def test_sigterm_ends_it_as_ctrl_c_does(
+    onnx: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step, num = Live.step, iter(range(1000))
+
+    def until_killed(self: Live) -> Any:
+        if next(num) == 20:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return step(self)
+
+    monkeypatch.setattr(Live, "step", until_killed)
+    before = signal.getsignal(signal.SIGTERM)
+    assert main(["live", str(onnx), "--always", "--calibration", "2", "--record", str(tmp_path / "r")]) == 0
+    assert "stopped" in (said := capsys.readouterr().err) and "summary: " in said
+    assert Pack(tmp_path / "r").num > 0 and signal.getsignal(signal.SIGTERM) == before
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,11 @@ import pytest
 from PIL import Image
 
 from mvitac.cli.main import main
+from mvitac.data.build import build
 from mvitac.data.images import difference, fit
 from mvitac.data.pack import Pack
 from mvitac.data.video import frames
+from mvitac.datasets.folder import FolderConfig
 from mvitac.deploy.engine import Engine
 from mvitac.live.cameras import Recording, recording
 from mvitac.live.contact import LiveConfig
@@ -149,6 +151,14 @@ def test_predict_command(
     one, row = pyarrow.csv.read_csv(tmp_path / "one.csv"), pyarrow.csv.read_csv(out).slice(7, 1)
     assert one.column("pattern.rows").to_pylist() == pytest.approx(row.column("pattern.rows").to_pylist(), abs=1e-5)
     capsys.readouterr()
+    (tmp_path / "some.csv").write_text("vision,touch\nvision.png,touch.png\n,touch.png\n")
+    some = FolderConfig(path=tmp_path / "some.csv", allow_missing=True, allow_leak=True, size=32)
+    build(some.source(), tmp_path / "some", size=32, quiet=True)
+    assert main([*command, str(tmp_path / "some"), "--out", str(out)]) == 0
+    assert "1 of 2 rows are left out" in capsys.readouterr().err
+    (tmp_path / "gel.csv").write_text("touch\ntouch.png\n")
+    assert main([*command, str(tmp_path / "gel.csv"), "--out", str(out)]) == 2
+    assert "has no vision, which the model takes too" in capsys.readouterr().err
     wrong = {
         (): "give one SOURCE",
         (str(films["touch"]), *both): "give one SOURCE",

@@ -7,6 +7,7 @@ the path of a field, e.g. /wrench.wrench.force.z. Each bag is a recording. Topic
 when a message was received where that is 0.
 """
 
+from collections import Counter
 from collections.abc import Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mvitac.data.images import ros_pixels
-from mvitac.datasets.table.clocks import joined, nearest
+from mvitac.datasets.table.clocks import check_moves, joined, nearest
 from mvitac.datasets.table.columns import element_of
 from mvitac.datasets.table.folders import recording_row
 from mvitac.datasets.table.image_refs import ImageRef
@@ -49,6 +50,11 @@ class RosbagConfig(RecordedConfig):
         path, bags = self.path, [self.path] if self.reads(self.path) else []
         if not bags and path.is_dir():
             bags = sorted([*(file.parent for file in path.rglob("metadata.yaml")), *path.rglob("*.bag")])
+            for file in sorted([*path.rglob("*.mcap"), *path.rglob("*.db3")]):
+                if file.parent not in bags:
+                    raise ValueError(
+                        f"{file} has no metadata.yaml (a recording that was killed): ros2 bag reindex, or move it"
+                    )
         if not bags:
             raise ValueError(f"{path} is no bag and holds none: give a folder with metadata.yaml, a .bag, or several")
         cameras = [topic for topic in (*self.touch, self.vision) if topic]
@@ -57,7 +63,7 @@ class RosbagConfig(RecordedConfig):
         smooth, every = self.numbers() if self.interpolate == "linear" else (), self.every or 1
         rows: list[Row] = []
         images: dict[str, list[ImageRef | None]] = {topic: [] for topic in cameras}
-        dropped = 0
+        dropped, same = 0, Counter[str]()
         for bag in bags:
             seen = _read(bag, cameras, [name for name in dict.fromkeys(named) if name])
             own = seen[cameras[0]][0][::every]
@@ -67,6 +73,8 @@ class RosbagConfig(RecordedConfig):
             cells: list[Row] = [{} for _ in own]
             at: dict[str, list[Any]] = {}
             for topic, (times, found) in seen.items():
+                check_moves(times, f"{bag}, topic {topic}")
+                same[topic] += len(times) - len(np.unique(times))
                 if topic in cameras:
                     index, away = nearest(times, own)
                     good &= away <= self.tolerance
@@ -75,6 +83,9 @@ class RosbagConfig(RecordedConfig):
                 joins, _ = joined(Manifest.of(bag, found), times, own, smooth, self.tolerance)
                 good &= np.array([bool(row) for row in joins], bool)
                 cells = [{**known, **row} for known, row in zip(cells, joins, strict=True)]
+            if not good.any():
+                spans = "; ".join(f"{topic} {t[0]:.3f} to {t[-1]:.3f} s" for topic, (t, _) in seen.items() if len(t))
+                raise ValueError(f"{bag} has no image with all others within {self.tolerance:g} s: {spans}")
             dropped += int((~good).sum())
             name = bag.relative_to(self.path).as_posix() if bag != self.path else bag.resolve().name
             for i in np.flatnonzero(good).tolist():
@@ -82,7 +93,8 @@ class RosbagConfig(RecordedConfig):
                 for topic in cameras:
                     images[topic].append(Message(str(bag), topic, *at[topic][i]))
         note = f"topics are joined by time within {self.tolerance:g} s; {dropped} images without all others left out"
-        return Manifest.of(self.path, rows, images, notes=(note,))
+        stamps = (f"; {num} messages of {topic} have the stamp of another" for topic, num in (+same).items())
+        return Manifest.of(self.path, rows, images, notes=("".join([note, *stamps]),))
 
 
 @contextmanager
@@ -108,9 +120,13 @@ def _read(bag: Path, cameras: Sequence[str], asked: Sequence[str]) -> dict[str, 
         if not cameras:
             shown = [topic for topic, kind in topics.items() if kind.endswith("Image")]
             raise ValueError(f"{bag} has image topics {', '.join(shown) or 'none'}: --data.vision, --data.touch TOPIC")
+        if not topics:
+            raise ValueError(f"{bag} is empty: leave it out")
         for topic in cameras:
             if topic not in topics:
                 raise ValueError(f"{bag}: {unknown('topic', topic, topics)}")
+            if not topics[topic].endswith("Image"):
+                raise ValueError(f"{bag}: {topic} is of {topics[topic]}, no images")
         fields = {t: [name for name in asked if name.startswith(f"{t}.")] for t in sorted(topics) if t not in cameras}
         used = [*cameras, *(topic for topic in fields if fields[topic])]
         found: dict[str, list[tuple[float, Any]]] = {topic: [] for topic in used}
@@ -120,7 +136,10 @@ def _read(bag: Path, cameras: Sequence[str], asked: Sequence[str]) -> dict[str, 
             topic, message = connection.topic, reader.deserialize(raw, connection.msgtype)
             stamp = getattr(getattr(message, "header", None), "stamp", None)
             time = 1e-9 * received if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
-            row = {name: _field(message, name.removeprefix(f"{topic}.")) for name in fields.get(topic, ())}
+            row = {
+                name: _field(message, name.removeprefix(f"{topic}."), f"{bag}, {topic}")
+                for name in fields.get(topic, ())
+            }
             found[topic].append((time or 1e-9 * received, row or place))
     ordered = {topic: sorted(each, key=lambda one: one[0]) for topic, each in found.items()}
     return {topic: (np.array([time for time, _ in each]), [v for _, v in each]) for topic, each in ordered.items()}
@@ -135,14 +154,14 @@ def _placed(messages: Iterator[Any]) -> Iterator[tuple[Any, tuple[int, int], Any
         yield connection, place, raw
 
 
-def _field(message: Any, path: str) -> str:
+def _field(message: Any, path: str, where: str) -> str:
     for name in path.split("."):
         vector, number = element_of(name)
         try:
             message = getattr(message, vector)[number] if vector else getattr(message, name)
         except (AttributeError, TypeError, IndexError):
             known = vars(message) if hasattr(message, "__dict__") else ()
-            raise ValueError(f"a message has no field {path}: {unknown('field', name, known)}") from None
+            raise ValueError(f"{where}: a message has no field {path}: {unknown('field', name, known)}") from None
     return text_of(message)
 
 

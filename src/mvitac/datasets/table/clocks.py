@@ -53,11 +53,11 @@ def times_of(video: Path) -> np.ndarray:
         raise ValueError(f"{file} has {len(stamps)} times, {video.name} has {len(times)} frames")
     if (np.diff(stamps) < 0).any():
         raise ValueError(f"{file}: time {np.argmax(np.diff(stamps) < 0) + 2} is before the one above it")
-    _check_moves(stamps, file)
+    check_moves(stamps, file)
     return stamps
 
 
-def _check_moves(stamps: np.ndarray, where: object) -> None:
+def check_moves(stamps: np.ndarray, where: object) -> None:
     """Raise ValueError if a clock stands still: everything would be joined to one image or measurement."""
     if len(stamps) > 1 and np.ptp(stamps) == 0:
         raise ValueError(
@@ -73,7 +73,7 @@ def row_times(table: Manifest, column: str, refs: Sequence[ImageRef | None]) -> 
     recordings = [row.get(table.group or "", "") for row in table.rows]
     if name := next((name for name in (column, *STAMPS) if name in table.columns), None):
         times = seconds(table.filled(name, "time"), where := f"{table.path}, column {name}")
-        _check_moves(times, where)
+        check_moves(times, where)
         return times, recordings
     known: dict[str, np.ndarray] = {}
     times = np.full(len(refs), np.nan)
@@ -117,7 +117,7 @@ def join(
             log.check(column)
             _check_apart(file, times[at], [recordings[i] for i in at])
             stamps = seconds(log.filled(column, "time"), f"{file}, column {column}") + shift
-            _check_moves(stamps, f"{file}, column {column}")
+            check_moves(stamps, f"{file}, column {column}")
             if len(back := np.flatnonzero(np.diff(stamps) < -0.1)) not in (0, len(stamps) - 1):  # s
                 where = f"{file}: the clock goes back after row {back[0] + 1}"
                 raise ValueError(f"{where}: mend it, or sort the rows by time")
