@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from PIL import Image
 
@@ -20,6 +19,7 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Target, ValueTask
+from support.toy import with_columns
 
 STEPS = 24
 
@@ -132,54 +132,40 @@ def test_numbers_that_would_be_wrong(pack: Pack) -> None:
     for row, other in zip(result["rows"], plain["rows"], strict=True):
         assert row["change"][0] == pytest.approx(other["change"][0] * 2 / 3)
     assert result["rows"][0]["change"][0] > 0.1
+    worse = next(r["parts"] for r in plain["rows"] if r["sense"] == "touch" and r["kind"] == "another episode")
+    assert worse["in contact"][0] > 3 * abs(worse["no contact"][0])
+    assert worse["last"][0] > worse["first third"][0]
 
 
 @pytest.mark.parametrize("cells", [["False", "True"], [False, True], [0, 1], [0.0, 1.0], ["no", "Yes"]])
 def test_contact_is_the_column_where_there_is_one(pack: Pack, cells: list[Any]) -> None:
-    made = copy.copy(pack)
     asked = np.arange(pack.num) % 3 > 0
-    made.table = pack.table.append_column("contact", pa.array([cells[one] for one in asked.astype(int)]))
+    made = with_columns(pack, contact=[cells[one] for one in asked.astype(int)])
     assert np.array_equal(read_episodes(made).touched, asked)
     assert not np.array_equal(read_episodes(pack).touched, asked)
 
 
 def test_an_episode_is_one_recording_of_a_group(pack: Pack) -> None:
-    made = copy.copy(pack)
-    column = made.table.column_names.index("group")
-    made.table = pack.table.set_column(column, "group", pa.array(["one object"] * pack.num))
+    made = with_columns(pack, group=["one object"] * pack.num)
     for own, theirs in zip(read_episodes(made).rows, read_episodes(pack).rows, strict=True):
         assert np.array_equal(own, theirs)
-    column = made.table.column_names.index("frame")
-    made.table = made.table.set_column(column, "frame", pa.array(np.arange(pack.num) // 2))
-    with pytest.raises(
-        ValueError, match=r"8 episodes have two rows with the same frame, the first at row \d+: pack with"
-    ):
-        read_episodes(made)
+    says = r"8 episodes have two rows with the same frame, the first at row \d+: pack with"
+    with pytest.raises(ValueError, match=says):
+        read_episodes(with_columns(made, frame=np.arange(pack.num) // 2))
 
 
 def test_episodes_that_say_nothing(pack: Pack) -> None:
     """Touch that is not there is black, and actions that never change have no scale: both were "does not use touch"."""
     for word in ("maybe", "nan"):
-        made = copy.copy(pack)
-        made.table = pack.table.append_column("contact", pa.array(["no"] * (pack.num - 1) + [word]))
         with pytest.raises(ValueError, match=f"column contact has '{word}': give yes or no"):
-            read_episodes(made)
-    made = copy.copy(pack)
-    made.table = pack.table.append_column("has_touch", pa.array(np.arange(pack.num) > 4))
+            read_episodes(with_columns(pack, contact=["no"] * (pack.num - 1) + [word]))
     with pytest.raises(ValueError, match="5 rows have no touch"):
-        read_episodes(made)
+        read_episodes(with_columns(pack, has_touch=np.arange(pack.num) > 4))
     for value in (np.nan, 3.0):
         made = copy.copy(pack)
         made.values = lambda task, value=value: np.full((pack.num, 2), value)  # type: ignore[method-assign,misc]
         with pytest.raises(ValueError, match="values action never change"):
             read_episodes(made)
-
-
-def test_in_contact_and_over_time(pack: Pack) -> None:
-    rows = ablate(needs, read_episodes(pack))["rows"]
-    worse = next(row for row in rows if row["sense"] == "touch" and row["kind"] == "another episode")["parts"]
-    assert worse["in contact"][0] > 3 * abs(worse["no contact"][0])
-    assert worse["last"][0] > worse["first third"][0]
 
 
 def test_in_a_closed_loop_success_is_the_measure() -> None:

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,32 +13,26 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack
 from mvitac.data.source import Sample
-from mvitac.data.spec import DataSpec, Task
+from mvitac.data.spec import Task
 from mvitac.training.loop import train
-from support.toy import Toy, toy_pack
+from support.toy import Toy, altered, toy_pack
 from support.training_runs import smoke
 
-
-class Negative(Toy):
-    """The toy under another sensor, whose touch is inverted and whose classes are numbered otherwise."""
-
-    order = ("checks", "columns", "rows")
-
-    def spec(self) -> DataSpec:
-        spec = super().spec()
-        return replace(spec, name="negative", tasks=(replace(spec.tasks[0], classes=self.order),), controls={})
-
-    def read(self, item: int) -> list[Sample]:
-        (sample,) = super().read(item)
-        assert sample.touch is not None
-        columns = {**sample.columns, "label_pattern": (sample.columns["label_pattern"] + 1) % 3, "has_touch": True}
-        del columns["label_bright"]
-        return [replace(sample, touch=255 - sample.touch, columns=columns)]
+ELSEWHERE = {"train": "test", "test": "train", "val": "train"}
+"""Splits in which other groups are test."""
 
 
 @pytest.fixture(scope="module")
 def negative(tmp_path_factory: pytest.TempPathFactory) -> Pack:
-    return build(Negative(), tmp_path_factory.mktemp("negative") / "p", size=32, quiet=True)
+    """The toy under another sensor, whose touch is inverted and whose classes are numbered otherwise."""
+    task = replace(Toy().spec().tasks[0], classes=("checks", "columns", "rows"))
+
+    def change(sample: Sample, _: int) -> dict[str, Any]:
+        label = (sample.columns["label_pattern"] + 1) % 3
+        return {"touch": 255 - sample.touch, "has_touch": True, "label_pattern": label, "label_bright": None}  # type: ignore
+
+    source = altered(Toy(), change, name="negative", tasks=(task,), controls={})
+    return build(source, tmp_path_factory.mktemp("negative") / "p", size=32, quiet=True)
 
 
 def test_train_is_of_the_one_and_test_of_the_other(pack: Pack, negative: Pack) -> None:
@@ -62,22 +57,10 @@ def test_train_is_of_the_one_and_test_of_the_other(pack: Pack, negative: Pack) -
 def test_columns_matter_that_probes_read(tmp_path: Path, column: str) -> None:
     """A name here, a number there: of no matter in a column beside, and text in one that says what a task is about."""
 
-    class Marked(Toy):
-        mark: object = "during"
-
-        def spec(self) -> DataSpec:
-            spec = super().spec()
-            only = {"phase": "during"} if column == "phase" else {}
-            return replace(spec, tasks=(replace(spec.tasks[0], only=only),))
-
-        def read(self, item: int) -> list[Sample]:
-            (sample,) = super().read(item)
-            return [replace(sample, columns={**sample.columns, column: self.mark})]
-
+    task = replace(Toy().spec().tasks[0], only={"phase": "during"} if column == "phase" else {})
     packs = []
     for name, mark in (("a", "during"), ("b", 3)):
-        source = Marked()
-        source.mark = mark
+        source = altered(Toy(), lambda *_, mark=mark: {column: mark}, tasks=(task,))
         packs.append(build(source, tmp_path / name, size=32, quiet=True))
     if column == "sensor":  # text on both sides
         assert JoinedPack(*packs).sensor_names == ("3", "during")
@@ -91,35 +74,24 @@ def test_columns_matter_that_probes_read(tmp_path: Path, column: str) -> None:
 
 
 def test_what_cannot_be_compared_is_refused(pack: Pack, negative: Pack, tmp_path: Path) -> None:
-    class Shuffled(Toy):
-        """Other groups are test here."""
+    def elsewhere(sample: Sample, _: int) -> dict[str, str]:
+        return {"split": ELSEWHERE[sample.columns["split"]]}
 
-        def read(self, item: int) -> list[Sample]:
-            (sample,) = super().read(item)
-            turned = {"train": "test", "test": "train", "val": "train"}
-            return [replace(sample, columns={**sample.columns, "split": turned[sample.columns["split"]]})]
+    def renamed(sample: Sample, _: int) -> dict[str, int]:
+        return {
+            name.replace("label_", "label_other "): sample.columns[name] for name in ("label_pattern", "label_bright")
+        }
 
-    class Other(Toy):
-        def spec(self) -> DataSpec:
-            spec = super().spec()
-            return replace(spec, tasks=tuple(replace(task, name=f"other {task.name}") for task in spec.tasks))
-
-        def read(self, item: int) -> list[Sample]:
-            (sample,) = super().read(item)
-            labels = {name.replace("label_", "label_other "): value for name, value in sample.columns.items()}
-            return [replace(sample, columns=labels)]
-
-    class New(Toy):
-        def spec(self) -> DataSpec:
-            spec = super().spec()
-            return replace(spec, tasks=(Task(name="pattern", classes=("columns", "rows", "waves")),))
-
-    with pytest.raises(ValueError, match=r"instance '.*' is learned from in .* and scored in .*, one of \d+"):
-        JoinedPack(pack, build(Shuffled(), tmp_path / "shuffled", size=32, quiet=True))
-    with pytest.raises(ValueError, match=r"no task is in both packs: .* has pattern, bright, .* other pattern"):
-        JoinedPack(pack, build(Other(), tmp_path / "other", size=32, quiet=True))
-    with pytest.raises(ValueError, match=r"class of pattern.*waves"):
-        JoinedPack(pack, build(New(), tmp_path / "new", size=32, quiet=True))
+    tasks = tuple(replace(task, name=f"other {task.name}") for task in Toy().spec().tasks)
+    waves = (Task(name="pattern", classes=("columns", "rows", "waves")),)
+    cases: dict[str, Toy] = {
+        r"instance '.*' is learned from in .* and scored in .*, one of \d+": altered(Toy(), elsewhere),
+        "no task is in both packs: .* has pattern, bright, .* other pattern": altered(Toy(), renamed, tasks=tasks),
+        "class of pattern.*waves": altered(Toy(), tasks=waves),
+    }
+    for number, (says, source) in enumerate(cases.items()):
+        with pytest.raises(ValueError, match=says):
+            JoinedPack(pack, build(source, tmp_path / str(number), size=32, quiet=True))
     with pytest.raises(ValueError, match=r"vision: 3 channels at 32 px in .*, 3 channels at 24 px in"):
         JoinedPack(pack, toy_pack(tmp_path / "small", size=24))
     alone = [toy_pack(tmp_path / f"touch{size}", size=size, vision_channels=0) for size in (24, 32)]
@@ -130,17 +102,12 @@ def test_what_cannot_be_compared_is_refused(pack: Pack, negative: Pack, tmp_path
 def test_an_image_that_is_learned_from_and_scored_is_refused(pack: Pack, tmp_path: Path) -> None:
     """Under other names, with another photo, and every row its own group."""
 
-    class Renamed(Toy):
-        def spec(self) -> DataSpec:
-            return replace(super().spec(), name="renamed", group_by="row")
+    def change(sample: Sample, item: int) -> dict[str, Any]:
+        names = {"id": f"new {item}", "group": f"{item + 1}", "split": ELSEWHERE[sample.columns["split"]]}
+        return {"vision": np.rot90(sample.vision), **names}  # type: ignore[arg-type]
 
-        def read(self, item: int) -> list[Sample]:
-            (sample,) = super().read(item)
-            split = {"train": "test", "test": "train", "val": "train"}[sample.columns["split"]]
-            names = {"id": f"new {item}", "group": f"{item + 1}", "split": split}
-            return [replace(sample, vision=np.rot90(sample.vision), columns={**sample.columns, **names})]  # type: ignore
-
-    renamed = build(Renamed(), tmp_path / "renamed", size=32, quiet=True)
+    source = altered(Toy(), change, name="renamed", group_by="row")
+    renamed = build(source, tmp_path / "renamed", size=32, quiet=True)
     for learn, score, row in ((pack, renamed, "new 0"), (renamed, pack, "0036")):
         with pytest.raises(ValueError, match=rf"the touch image of row '{row}' is learned from in .* one of \d+: give"):
             JoinedPack(learn, score)

@@ -19,14 +19,14 @@ from mvitac.data import jpeg
 from mvitac.data.build import build
 from mvitac.data.jpeg import Jpegs, decode, encode
 from mvitac.data.pack import Pack
-from mvitac.data.source import Sample, Source
+from mvitac.data.source import Source
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.run import Run
 from mvitac.training.loop import train
 from mvitac.training.sampler import Batches
 from mvitac.training.views import StepViews
 from support.forged_packs import described, seal
-from support.toy import Holes, Toy
+from support.toy import Holes, Toy, altered
 from support.training_runs import assert_equal_weights, smoke
 
 FILES = ("pack.json", "samples.parquet", "vision.jpegs", "touch.jpegs")
@@ -184,13 +184,8 @@ def test_a_row_that_cannot_be_decoded_is_named(small: Pack, tmp_path: Path, kind
 @pytest.fixture(scope="module")
 def decoded(small: Pack, tmp_path_factory: pytest.TempPathFactory) -> Pack:
     """A raw pack of the pixels that the pack of JPEGs decodes to."""
-
-    class Decoded(Toy):
-        def read(self, item: int) -> list[Sample]:
-            (sample,) = super().read(item)
-            return [replace(sample, **{m: small.images[m][item] for m in ("vision", "touch")})]  # type: ignore[arg-type]
-
-    return build(Decoded(), tmp_path_factory.mktemp("decoded") / "pack", size=32, quiet=True)
+    decoded = altered(Toy(), lambda _, item: {m: small.images[m][item] for m in ("vision", "touch")})
+    return build(decoded, tmp_path_factory.mktemp("decoded") / "pack", size=32, quiet=True)
 
 
 def run_on(pack: Pack, **changes: Any) -> Run:

@@ -1,7 +1,7 @@
 """Several packs as one: rows, images, tasks and splits are those of the parts, and what cannot be mixed is refused."""
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +12,12 @@ from mvitac.cli.main import main
 from mvitac.data.images import fit
 from mvitac.data.pack import Pack
 from mvitac.data.several import MixedPack
-from mvitac.data.source import Sample
-from mvitac.data.spec import DataSpec, Target, ValueTask, Window
+from mvitac.data.spec import Target, ValueTask, Window
 from mvitac.data.windows import windowed
 from mvitac.datasets.mix import MixConfig
 from mvitac.evaluation.leaks import Scored, source_of
 from support.mixes import Gel, Slice, built
-from support.toy import Toy, Turned
+from support.toy import Toy, Turned, altered
 
 
 @pytest.fixture(scope="module")
@@ -70,33 +69,19 @@ def test_one_task_if_classes_agree_else_two(pack: Pack, gel: Pack) -> None:
     np.testing.assert_array_equal(np.isfinite(mix.column("noise")), mix.column("part") == "toy")
 
 
-@dataclass
-class Pressed(Slice):
+def pressed(first: int = 0, unit: str = "N", kind: Any = 1, own_split: bool = False) -> Toy:
     """The stripes with a force, in ``unit``, of one phase, and a split of their own for it."""
-
-    unit: str = "N"
-    kind: Any = 1
-    own_split: bool = False
-
-    def spec(self) -> DataSpec:
-        split = "split_force" if self.own_split else "split"
-        task = ValueTask(name="force", targets=(Target(name="force", unit=self.unit),), only={"kind": "1"}, split=split)
-        return replace(super().spec(), values=(task,))
-
-    def fingerprint(self) -> dict[str, Any]:
-        return {**super().fingerprint(), "pressed": [self.unit, self.kind, self.own_split]}
-
-    def read(self, item: int) -> list[Sample]:
-        (sample,) = super().read(item)
-        extra = {"force": item / 2, "kind": self.kind, **({"split_force": "test"} if self.own_split else {})}
-        return [replace(sample, columns={**sample.columns, **extra})]
+    extra = {"kind": kind, **({"split_force": "test"} if own_split else {})}
+    split = "split_force" if own_split else "split"
+    task = ValueTask(name="force", targets=(Target(name="force", unit=unit),), only={"kind": "1"}, split=split)
+    return altered(Slice(num=30, first=first), lambda _, item: {"force": item / 2, **extra}, values=(task,))
 
 
 @pytest.mark.parametrize("other", [{"unit": "mN"}, {"own_split": True}, {"kind": "1"}, {}], ids=str)
 def test_values_keep_their_unit_rows_and_split(gel: Pack, tmp_path: Path, other: dict[str, Any]) -> None:
     """Where ``kind`` is a number here and a text there, the task is the same: conditions compare text."""
-    a = built(Pressed(num=30), tmp_path / "a")
-    b = built(Pressed(num=30, first=60, **other), tmp_path / "b")
+    a = built(pressed(), tmp_path / "a")
+    b = built(pressed(60, **other), tmp_path / "b")
     mix = MixedPack({"a": a, "b": b, "gel": gel})
     names = [task.name for task in mix.spec.values]
     apart = bool(other) and "kind" not in other
@@ -117,19 +102,10 @@ def test_values_keep_their_unit_rows_and_split(gel: Pack, tmp_path: Path, other:
 
 def test_rows_are_hidden_as_in_their_part(pack: Pack, tmp_path: Path) -> None:
     """A part whose tasks all have splits of their own hides no row, though the other part has tasks of the common split."""
-
-    @dataclass
-    class Listed(Slice):
-        prefix: str = "listed "
-
-        def spec(self) -> DataSpec:
-            return replace(super().spec(), tasks=(replace(super().spec().tasks[1], split="split_bright"),))
-
-        def read(self, item: int) -> list[Sample]:
-            (sample,) = super().read(item)
-            return [replace(sample, columns={**sample.columns, "split_bright": sample.columns["split"]})]
-
-    listed = built(Listed(num=60), tmp_path / "p", size=16)
+    task = replace(pack.spec.tasks[1], split="split_bright")
+    source = Slice(num=60, prefix="listed ")
+    own = altered(source, lambda sample, _: {"split_bright": sample.columns["split"]}, tasks=(task,))
+    listed = built(own, tmp_path / "p", size=16)
     mix = MixedPack({"toy": pack, "listed": listed})
     assert [task.name for task in mix.spec.tasks] == ["pattern", "toy/bright", "listed/bright"]
     assert not mix.hidden.any() and not listed.hidden.any()
@@ -184,19 +160,11 @@ def test_an_image_on_two_sides_under_two_names_is_refused(pack: Pack, tmp_path: 
 
 
 def test_what_cannot_be_mixed_is_refused(pack: Pack, tmp_path: Path) -> None:
-    class Scores(Slice):
-        def read(self, item: int) -> list[Sample]:
-            (sample,) = super().read(item)
-            return [replace(sample, columns={**sample.columns, "split": "test"})]
-
-    class Minus(Slice):
-        def spec(self) -> DataSpec:
-            return replace(super().spec(), difference=True)
-
+    tested = altered(Slice(num=12), lambda *_: {"split": "test"})
     cases: list[tuple[Toy, str]] = [
-        (Scores(num=12), "part b .* has no rows in split train or unlabelled: leave it out"),
+        (tested, "part b .* has no rows in split train or unlabelled: leave it out"),
         (Slice(num=12, touch_channels=6), "touch channels differ: .*'a': 3, 'b': 6.; pack"),
-        (Minus(num=12), "touch is minus its background in b and not in a: pack both alike"),
+        (altered(Slice(num=12), difference=True), "touch is minus its background in b and not in a: pack both alike"),
         (Toy(), "two of the parts a, b are the same data: give each pack once, with a weight"),
     ]
     for number, (source, message) in enumerate(cases):

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from filelock import FileLock
 
@@ -29,7 +28,7 @@ from mvitac.data.source import Lost, Sample, Source
 from mvitac.datasets.pack import ON_VAL, PackConfig
 from mvitac.evaluation.retrieval import retrieved_rows
 from mvitac.system import locks
-from support.toy import Counting, Toy, threads_of, toy_pack
+from support.toy import Counting, Toy, threads_of, toy_pack, with_columns
 
 FILES = ("pack.json", "samples.parquet", "vision.npy", "touch.npy")
 
@@ -335,19 +334,14 @@ def test_scoring_on_val_hides_test(pack: Pack) -> None:
 
 def test_rows_of_one_task_alone_are_hidden_from_all_else(pack: Pack) -> None:
     """A task with a split of its own may score rows that no other task labels. Nothing else may count them as test."""
-    other = Pack(pack.path)
     first, second = pack.spec.tasks
     alone = np.isin(pack.column("split"), ("test", "train")) & (np.arange(pack.num) % 2 == 0)
     label = np.where(alone, -1, pack.column("label_pattern"))
-    place = other.table.column_names.index("label_pattern")
-    other.table = other.table.set_column(place, "label_pattern", pa.array(label))
-    other.table = other.table.append_column("split_bright", pa.array(["train", "test"] * (pack.num // 2)))
-    other.spec = replace(pack.spec, tasks=(first, replace(second, split="split_bright")))
+    columns = {"label_pattern": label, "split_bright": ["train", "test"] * (pack.num // 2)}
+    other = with_columns(pack, spec=replace(pack.spec, tasks=(first, replace(second, split="split_bright"))), **columns)
     hidden = set(np.flatnonzero(alone & (pack.column("split") == "test")))
     assert hidden and set(pack.rows("test")) - set(other.rows("test")) == hidden == set(np.flatnonzero(other.hidden))
     assert set(other.rows("train")) == set(pack.rows("train"))  # without a label, but for pre-training
     assert set(other.rows("train", by="split_bright")) == set(range(0, pack.num, 2))  # its own split has them
     assert not {*retrieved_rows(other, "test")} & hidden and hidden < {*retrieved_rows(pack, "test")}
-    unlabelled = Pack(pack.path)
-    unlabelled.table = other.table
-    assert not unlabelled.hidden.any()  # one split for all tasks: nobody else may see them
+    assert not with_columns(pack, **columns).hidden.any()  # one split for all tasks: nobody else may see them

@@ -11,7 +11,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 import torch
 from sklearn.linear_model import LogisticRegression
@@ -46,7 +45,7 @@ from mvitac.system.device import Hardware
 from mvitac.system.files import read_json
 from mvitac.training import setup
 from mvitac.training.loop import train
-from support.toy import Toy, renumbered, toy_pack
+from support.toy import Toy, renumbered, toy_pack, with_columns
 
 
 @pytest.fixture(scope="module")
@@ -247,7 +246,7 @@ def test_retrieval_needs_enough_groups_to_choose_from(result: dict, tmp_path: Pa
     test, groups = ten.rows("test"), ten.column("group").astype(str)
     names = np.unique(groups[test])
     groups[np.isin(groups, names[10:])] = names[0]
-    ten.table = ten.table.set_column(ten.table.schema.get_field_index("group"), "group", pa.array(groups))
+    ten = with_columns(ten, group=groups)
     assert len(set(groups[test])) == 10  # the best five of ten are half of them
     run = recipe("smoke", PackConfig(path=ten.path))
     assert cross_modal(fresh(run, ten.spec, ten.size), ten) == []
@@ -339,10 +338,8 @@ def test_each_share_has_its_rows_and_one_of_each_class(pack: Pack) -> None:
 
 
 def test_few_values_keep_two_of_each_target(measured: Pack) -> None:
-    pack, task = Pack(measured.path), measured.spec.values[1]
-    weight = np.where(np.arange(pack.num) // 3 % 2, np.arange(pack.num), np.nan)  # one row of each group has it
-    at = pack.table.column_names.index("weight")
-    pack.table = pack.table.set_column(at, "weight", pa.array(weight))
+    task, number = measured.spec.values[1], np.arange(measured.num)
+    pack = with_columns(measured, weight=np.where(number // 3 % 2, number, np.nan))  # one row of each group has it
     rows = split_rows(pack, task)
     train, val = few(pack, task, rows.train, rows.val, 1, seed=0)
     for kept in (rows.train[train], rows.val[val]):

@@ -1,12 +1,11 @@
 """Sensors in probes: statistics from unlabelled images, colours of known sensors."""
 
-import copy
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from mvitac.cli.main import main
@@ -28,35 +27,18 @@ from mvitac.model import Model, load
 from mvitac.nn.initial import Init
 from mvitac.run import load_run
 from mvitac.training.loop import train
-from support.toy import Toy
+from support.toy import Toy, altered, with_columns
 from support.training_runs import smoke
-
-
-class Others(Toy):
-    """The striped pairs through two sensors, by turns; the second inverts touch."""
-
-    def read(self, item: int) -> list[Sample]:
-        (sample,) = super().read(item)
-        assert sample.touch is not None
-        touch = 255 - sample.touch if item % 2 else sample.touch
-        columns = {**sample.columns, "sensor": "negative" if item % 2 else "plain"}
-        return [replace(sample, touch=touch, columns=columns)]
-
-
-def with_columns(pack: Pack, **columns: np.ndarray) -> Pack:
-    """``pack`` with other columns in its table, in memory."""
-    made = copy.copy(pack)
-    cached = ("sensors", "sensor_names", "presses", "_rows_by")
-    made.__dict__ = {name: value for name, value in pack.__dict__.items() if name not in cached}
-    made.table = pack.table.drop_columns([name for name in columns if name in pack.table.column_names])
-    for name, values in columns.items():
-        made.table = made.table.append_column(name, pa.array(values.tolist()))
-    return made
 
 
 @pytest.fixture(scope="module")
 def others(tmp_path_factory: pytest.TempPathFactory) -> Pack:
-    return build(Others(), tmp_path_factory.mktemp("others") / "pack", size=32, quiet=True)
+    """The striped pairs through two sensors, by turns; the second inverts touch."""
+
+    def change(sample: Sample, item: int) -> dict[str, Any]:
+        return {"sensor": "negative", "touch": 255 - sample.touch} if item % 2 else {"sensor": "plain"}  # type: ignore
+
+    return build(altered(Toy(), change), tmp_path_factory.mktemp("others") / "pack", size=32, quiet=True)
 
 
 @pytest.fixture(scope="module")

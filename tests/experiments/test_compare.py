@@ -22,7 +22,6 @@ from PIL import Image
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
-from mvitac.data.source import Sample
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import ON_VAL, PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
@@ -42,7 +41,7 @@ from mvitac.training.loop import Interrupted, train
 from mvitac.training.step import Step
 from support.processes import begin, finish
 from support.small_plans import ROWS, small
-from support.toy import Toy, toy_pack
+from support.toy import Toy, altered, toy_pack, with_columns
 
 TABLE1, TABLE2, ABLATION = map(find_plan, PLANS[:3])
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -114,12 +113,8 @@ def test_rows_the_data_does_not_allow_are_told(tmp_path: Path) -> None:
 
 def test_a_row_may_read_the_same_samples_in_another_way(pack: Pack, tmp_path: Path) -> None:
     """As difference images are: trained and scored on its own pack, beside the others; other samples are refused."""
-
-    class Darker(Toy):
-        def read(self, item: int) -> list[Sample]:
-            return [replace(sample, touch=sample.touch // 2) for sample in super().read(item)]  # type: ignore[operator]
-
-    darker = build(Darker(), tmp_path / "darker", size=32, quiet=True)
+    dark = altered(Toy(), lambda sample, _: {"touch": sample.touch // 2})
+    darker = build(dark, tmp_path / "darker", size=32, quiet=True)
     fewer = toy_pack(tmp_path / "fewer", num=90)
     rows = (
         Row(label="MViTac"),
@@ -413,9 +408,7 @@ def test_cost_counts_images_and_seconds(done: tuple[Path, dict], pack: Pack) -> 
 def test_a_leak_of_a_tasks_own_split_is_flagged(pack: Pack) -> None:
     """Every fourth row is tested: its group's other row is learned from."""
     pattern, bright = pack.spec.tasks
-    own = copy(pack)
-    sides = np.where(np.arange(pack.num) % 4 == 0, "test", "train")
-    own.table = pack.table.append_column("split_bright", pa.array(sides))
+    own = with_columns(pack, split_bright=np.where(np.arange(pack.num) % 4 == 0, "test", "train"))
     task = replace(bright, split="split_bright")
     said = own.split_leaks([pattern, task])
     assert said == {"split_bright": "30 of 30 test instances of bright are also in train: this split leaks"}

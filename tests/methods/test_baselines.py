@@ -5,7 +5,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import pyarrow as pa
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
@@ -30,7 +30,7 @@ from mvitac.run import Optim
 from mvitac.training.loop import train
 from mvitac.training.views import StepViews
 from support.small_methods import ROWS, TINY, build, outcome, slow_info_nce, small, views
-from support.toy import Toy
+from support.toy import Toy, with_columns
 from support.training_runs import smoke
 
 
@@ -263,16 +263,11 @@ def test_vicreg_weighs_its_terms() -> None:
 @pytest.mark.parametrize("config", [SupervisedConfig, CalandraConfig])
 def test_supervised_learns_the_labels_that_probes_are_fitted_on(pack: Pack, config: type) -> None:
     """Also of a task with a split of its own, as rough of Touch and Go's lists, and of rows without the other sense."""
-    other = copy.copy(pack)
-    other._answers = {}  # type: ignore[misc]
-    other.__dict__.pop("whole", None)  # cached, too
     first, second = pack.spec.tasks
-    other.spec = replace(pack.spec, tasks=(first, replace(second, split="split_bright")))
+    spec = replace(pack.spec, tasks=(first, replace(second, split="split_bright")))
     turned = {"test": "train", "train": "test"}
-    columns = {"split_bright": [turned.get(s, s) if row % 2 else s for row, s in enumerate(pack.column("split"))]}
-    columns["has_vision"] = [row % 5 > 0 for row in range(pack.num)]
-    for name, values in columns.items():
-        other.table = other.table.append_column(name, pa.array(values))
+    own = [turned.get(s, s) if row % 2 else s for row, s in enumerate(pack.column("split"))]
+    other = with_columns(pack, spec=spec, split_bright=own, has_vision=np.arange(pack.num) % 5 > 0)
     for sense in ("touch", "vision", "both"):
         method = config(modalities=() if sense == "both" else (sense,))
         rows = method.training_rows(other)

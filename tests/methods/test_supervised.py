@@ -1,6 +1,5 @@
 """Fine-tuning as a method, and the supervised methods on tasks with values."""
 
-import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from mvitac.run import Optim
 from mvitac.training.loop import train
 from mvitac.training.views import values_of
 from support.small_methods import TINY
+from support.toy import with_columns
 from support.training_runs import smoke
 
 
@@ -90,8 +90,7 @@ def test_classes_are_the_default_and_values_are_learned_by_name_or_alone(measure
 def test_values_are_learned_from_the_rows_that_probes_are_fitted_on(measured: Pack) -> None:
     both = measured.spec.values[1]
     weight = replace(both, name="weight", targets=both.targets[1:])
-    measured = copy.copy(measured)
-    measured.spec = replace(measured.spec, values=(*measured.spec.values[:2], weight))
+    measured = with_columns(measured, spec=replace(measured.spec, values=(*measured.spec.values[:2], weight)))
     method = SupervisedConfig(tasks=("weight",))
     rows = method.training_rows(measured)
     assert set(rows) == set(split_rows(measured, weight).fitted) and 0 < len(rows) < measured.num

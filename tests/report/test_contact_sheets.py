@@ -1,19 +1,17 @@
 """The contact sheet: every class there, groups spread, each pixel where its row says, gaps shown as gaps."""
 
-import copy
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.report import contact_sheet
 from mvitac.report.contact_sheet import pair
-from support.toy import Toy
+from support.toy import Toy, with_columns
 
 
 def rows_of(pack: Pack, tiles: Sequence[contact_sheet.Tile]) -> list[int]:
@@ -30,9 +28,7 @@ def test_every_class_is_there_and_spread_over_groups(pack: Pack) -> None:
 
 
 def test_without_labels_every_group_is_a_class(pack: Pack) -> None:
-    plain = copy.copy(pack)
-    plain.spec = replace(pack.spec, tasks=())
-    *found, last = contact_sheet.samples(plain)
+    *found, last = contact_sheet.samples(with_columns(pack, spec=replace(pack.spec, tasks=())))
     assert len(found) == 40 and all(len(tiles) == 2 for _, tiles in found) and last == ("20 more are not shown", [])
 
 
@@ -58,8 +54,7 @@ def test_pixels_lie_where_they_should(tmp_path: Path, touch_channels: int) -> No
 
 
 def test_a_gap_is_crossed_out(pack: Pack) -> None:
-    gappy = Pack(pack.path)
-    gappy.table = pack.table.append_column("has_touch", pa.array(np.arange(pack.num) != 4))
+    gappy = with_columns(pack, has_touch=np.arange(pack.num) != 4)
     gap, whole = (pair(gappy, row, 32)[:, 32:] for row in (4, 5))
     assert (gap[1, 15] == 225).all() and (gap[16, 16] < 200).all()
     assert (whole == pack.images["touch"][5]).all()

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
-from mvitac.data.spec import DataSpec
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.probe import split_rows
@@ -30,23 +29,13 @@ from mvitac.system.files import read_json
 from mvitac.training.loop import train
 from support.pages import drawings
 from support.small_plans import compared
-from support.toy import Toy
+from support.toy import Toy, altered
 
 
-class OneTested(Toy):
-    """Values alone, of touch alone; all but one group to learn from."""
-
-    def spec(self) -> DataSpec:
-        return replace(super().spec(), tasks=())
-
-    def read(self, item: int) -> list[Sample]:
-        (made,) = super().read(item)
-        columns = {name: value for name, value in made.columns.items() if not name.startswith("label_")}
-        split = "test" if columns["group"] == "1-4" else "train"
-        return [replace(made, columns={**columns, "split": split, "weight": float(item)})]
-
-    def fingerprint(self) -> dict[str, Any]:
-        return {"one": self.num}
+def one_tested(sample: Sample, item: int) -> dict[str, Any]:
+    """All but one group to learn from, values alone."""
+    split = "test" if sample.columns["group"] == "1-4" else "train"
+    return {"split": split, "weight": float(item), "label_pattern": None, "label_bright": None}
 
 
 def scored_run(folder: Path, source: Toy, **session: Any) -> tuple[Path, Pack, dict[str, Any]]:
@@ -115,7 +104,8 @@ def test_the_report_shows_values(scored: tuple[Path, Pack, dict[str, Any]], tmp_
 
 
 def test_one_test_group_of_values_alone(tmp_path: Path) -> None:
-    run, _, result = scored_run(tmp_path, OneTested(values=True, vision_channels=0, num=48))
+    source = altered(Toy(values=True, vision_channels=0, num=48), one_tested, tasks=())
+    run, _, result = scored_run(tmp_path, source)
     stored = read_json(run / "probe.json", "scores")
     cell = stored["summary"]["both"]["touch"]["pixels"]
     assert cell["low"] is None and cell["groups"] == 1 and cell["targets"][0]["low"] is None
@@ -177,13 +167,10 @@ def test_predictions_that_are_exact_lie_on_the_line() -> None:
 
 
 def test_a_target_without_values_in_test_is_named(tmp_path: Path) -> None:
-    class Untested(Toy):
-        def read(self, item: int) -> list[Sample]:
-            (made,) = super().read(item)
-            weight = float("nan") if made.columns["split"] == "test" else float(item)
-            return [replace(made, columns={**made.columns, "weight": weight})]
+    def untested(sample: Sample, item: int) -> dict[str, Any]:
+        return {"weight": float("nan") if sample.columns["split"] == "test" else float(item)}
 
-    pack = build(Untested(values=True), tmp_path / "pack", size=16, workers=1, quiet=True)
+    pack = build(altered(Toy(values=True), untested), tmp_path / "pack", size=16, workers=1, quiet=True)
     with pytest.raises(ValueError, match="task 'both': weight has fewer than two different values in split test"):
         split_rows(pack, pack.spec.values[1])
     assert len(split_rows(pack, pack.spec.values[0]).test)

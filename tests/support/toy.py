@@ -4,7 +4,9 @@ The three patterns (columns, rows, checks) stay themselves under a horizontal fl
 """
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -110,15 +112,37 @@ class Counting(Toy):
         return super().read(item)
 
 
+def altered(source: Source, change: Callable[[Sample, int], dict[str, Any]] = lambda *_: {}, **about: Any) -> Any:
+    """``source`` with other images and columns (None: without it), which ``change`` makes of a sample and the number of its
+    item, and with other fields of its spec."""
+    made, spec, read = copy.copy(source), replace(source.spec(), **about), source.read
+
+    def changed(sample: Sample, item: int) -> Sample:
+        new = {**sample.columns, "vision": sample.vision, "touch": sample.touch, **change(sample, item)}
+        images = {m: new.pop(m) for m in ("vision", "touch")}
+        return Sample(**images, columns={name: value for name, value in new.items() if value is not None})
+
+    made.spec, made.read = lambda: spec, lambda item: [changed(sample, item) for sample in read(item)]  # type: ignore
+    return made
+
+
+def with_columns(pack: Pack, *, spec: DataSpec | None = None, **columns: Any) -> Pack:
+    """``pack`` with other columns in its table, and another spec, in memory."""
+    made, cached = copy.copy(pack), {name for name, kind in vars(Pack).items() if isinstance(kind, cached_property)}
+    made.__dict__ = {name: value for name, value in vars(pack).items() if name not in cached}
+    made.spec = spec or pack.spec
+    made.table = pack.table.drop_columns([name for name in columns if name in pack.table.column_names])
+    for name, values in columns.items():
+        made.table = made.table.append_column(name, pa.array(values))
+    return made
+
+
 def renumbered(pack: Pack, *classes: str) -> Pack:
     """``pack``, its patterns listed as ``classes``; rows of any other have no label."""
-    other = copy.copy(pack)
     first, *rest = pack.spec.tasks
-    other.spec = replace(pack.spec, tasks=(replace(first, classes=classes), *rest))
     numbers = np.array([classes.index(name) if name in classes else -1 for name in first.classes])
-    at, labels = pack.table.column_names.index("label_pattern"), numbers[pack.column("label_pattern")]
-    other.table = pack.table.set_column(at, "label_pattern", pa.array(labels))
-    return other
+    spec = replace(pack.spec, tasks=(replace(first, classes=classes), *rest))
+    return with_columns(pack, spec=spec, label_pattern=numbers[pack.column("label_pattern")])
 
 
 def toy_pack(path: Path, size: int = 32, **kwargs: Any) -> Pack:

@@ -23,6 +23,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Task
 from mvitac.datasets.folder import FolderConfig
+from support.toy import altered
 
 NUM_OBJECTS, NUM_FRAMES, SIDE = 20, 16, 32
 TEST, VAL = (3, 8, 13, 18), (4, 9)
@@ -276,34 +277,25 @@ def test_the_command_on_a_source(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_the_lag_is_touch_after_vision(late: int, tmp_path: Path) -> None:
     """Brightness jumps of the same sizes in both streams, in touch ``late`` rows after vision; the signs are random."""
 
-    class Flashes(Presses):
-        def read(self, item: int) -> list[Sample]:
-            obj, k = divmod(item, NUM_FRAMES)
-            jumps = np.random.default_rng(obj).choice([1, 12], NUM_FRAMES + 20)
-            level = 128 + np.cumsum(jumps * np.resize([1, -1], len(jumps)))
-            sample = super().read(item)[0]
-            images = [np.full((SIDE, SIDE, 3), level[10 + k - shift], np.uint8) for shift in (0, late)]
-            return [Sample(vision=images[0], touch=images[1], columns=sample.columns)]
+    def flash(_: Sample, item: int) -> dict[str, np.ndarray]:
+        obj, k = divmod(item, NUM_FRAMES)
+        jumps = np.random.default_rng(obj).choice([1, 12], NUM_FRAMES + 20)
+        level = 128 + np.cumsum(jumps * np.resize([1, -1], len(jumps)))
+        shifts = {"vision": 0, "touch": late}
+        return {m: np.full((SIDE, SIDE, 3), level[10 + k - shift], np.uint8) for m, shift in shifts.items()}
 
-    pack = build(Flashes(), tmp_path / "p", size=SIDE, quiet=True)
+    pack = build(altered(Presses(), flash), tmp_path / "p", size=SIDE, quiet=True)
     curves = motion_correlations(pack, look_at(pack), pack.column("seq").astype(float))
     assert curves.mean(0).argmax() - MAX_LAG == late
     assert len(curves) == NUM_OBJECTS
 
 
 def test_what_cannot_be_checked_is_said_and_costs_nothing(tmp_path: Path) -> None:
-    class TouchOnly(Presses):
-        def spec(self) -> DataSpec:
-            return replace(super().spec(), vision_channels=0, touch_channels=6)
+    def touch_only(sample: Sample, _: int) -> dict[str, Any]:
+        both = np.concatenate([sample.touch, sample.touch[::-1]], axis=2)  # type: ignore[index, list-item]
+        return {"vision": None, "touch": both, "seq": None, "sensor": None}
 
-        def read(self, item: int) -> list[Sample]:
-            sample = super().read(item)[0]
-            assert sample.touch is not None
-            columns = {name: value for name, value in sample.columns.items() if name not in ("seq", "sensor")}
-            both = np.concatenate([sample.touch, sample.touch[::-1]], axis=2)
-            return [Sample(vision=None, touch=both, columns=columns)]
-
-    findings = check(TouchOnly(), tmp_path)
+    findings = check(altered(Presses(), touch_only, vision_channels=0, touch_channels=6), tmp_path)
     cannot = {item for item, f in findings.items() if f.verdict == "not checkable"}
     assert cannot == {"time offset between streams"}
     assert "touch 2: all in one order" in findings["red and blue swapped"].evidence
@@ -312,16 +304,13 @@ def test_what_cannot_be_checked_is_said_and_costs_nothing(tmp_path: Path) -> Non
 
 def test_missing_images_are_no_faults_of_the_others() -> None:
     """A third of the rows without vision: no constant frames, no copies; only a split without any is worth a look."""
-
-    class Gaps(Presses):
-        def read(self, item: int) -> list[Sample]:
-            sample = super().read(item)[0]
-            gone = item // NUM_FRAMES in TEST if self.fault == "test" else item % 3 == 1
-            columns = {**sample.columns, "has_vision": not gone}
-            return [Sample(vision=None if gone else sample.vision, touch=sample.touch, columns=columns)]
-
     for fault in ("", "test"):
-        findings = examine_source(Gaps(fault), size=SIDE, quiet=True)
+
+        def gap(sample: Sample, item: int, fault: str = fault) -> dict[str, Any]:
+            gone = item // NUM_FRAMES in TEST if fault else item % 3 == 1
+            return {"has_vision": not gone, "vision": None if gone else sample.vision}
+
+        findings = examine_source(altered(Presses(), gap), size=SIDE, quiet=True)
         told = {f.item: f for f in findings}
         wrong = {f.item for f in findings if f.verdict in ("look", "broken")}
         assert wrong == ({"missing images"} if fault else set())
@@ -333,22 +322,15 @@ def test_a_task_is_judged_by_its_own_split(tmp_path: Path) -> None:
     """As Touch and Go's rough/smooth: its lists divide recordings otherwise than those of the categories, and of those
     that they divide they may leave frames out."""
 
-    class Otherwise(Presses):
-        def spec(self) -> DataSpec:
-            spec = super().spec()
-            other = Task(name="rough", classes=("smooth", "rough"), split="split_rough")
-            return replace(spec, tasks=(*spec.tasks, other))
+    def otherwise(_: Sample, item: int) -> dict[str, Any]:
+        obj = item // NUM_FRAMES
+        if item % NUM_FRAMES == 9 and obj > 8:
+            return {"label_rough": -1, "split_rough": "test"}
+        # By ``split`` no object of class 1 is learned from; by its own column both classes are on both sides.
+        return {"label_rough": int(obj in TEST), "split_rough": "test" if obj in (3, 8, 0, 1) else "train"}
 
-        def read(self, item: int) -> list[Sample]:
-            sample = super().read(item)[0]
-            obj = item // NUM_FRAMES
-            # By ``split`` no object of class 1 is learned from; by its own column both classes are on both sides.
-            own = {"label_rough": int(obj in TEST), "split_rough": "test" if obj in (3, 8, 0, 1) else "train"}
-            if item % NUM_FRAMES == 9 and obj > 8:
-                own = {"label_rough": -1, "split_rough": "test"}
-            return [replace(sample, columns={**sample.columns, **own})]
-
-    findings = check(Otherwise(), tmp_path)
+    rough = Task(name="rough", classes=("smooth", "rough"), split="split_rough")
+    findings = check(altered(Presses(), otherwise, tasks=(*Presses().spec().tasks, rough)), tmp_path)
     assert "always saying 'smooth' scores 50.0 % on test" in findings["labels of rough"].evidence
     assert "; 11 of " in findings["labels of rough"].evidence and "first 09-09" in findings["labels of rough"].evidence
     assert {f.item for f in findings.values() if f.verdict in ("look", "broken")} == {"labels of rough"}
@@ -356,15 +338,13 @@ def test_a_task_is_judged_by_its_own_split(tmp_path: Path) -> None:
 
 
 def test_what_was_not_compared_is_not_called_well(tmp_path: Path) -> None:
-    class Untested(Presses):
-        def read(self, item: int) -> list[Sample]:
-            sample = super().read(item)[0]
-            colours = np.random.default_rng(item).integers(0, 256, (2, 1, 1, 3), np.uint8)
-            vision, touch = (np.full((SIDE, SIDE, 3), c, np.uint8) for c in colours)
-            vision[:4], touch[:4] = 0, 0
-            return [Sample(vision=vision, touch=touch, columns={**sample.columns, "split": "train"})]
+    def untested(_: Sample, item: int) -> dict[str, Any]:
+        colours = np.random.default_rng(item).integers(0, 256, (2, 1, 1, 3), np.uint8)
+        vision, touch = (np.full((SIDE, SIDE, 3), c, np.uint8) for c in colours)
+        vision[:4], touch[:4] = 0, 0
+        return {"vision": vision, "touch": touch, "split": "train"}
 
-    findings = check(Untested(), tmp_path)
+    findings = check(altered(Presses(), untested), tmp_path)
     near, colour = findings["near-copies across splits"], findings["red and blue swapped"]
     assert (near.verdict, near.evidence) == ("not checkable", "vision: all in one split; touch: all in one split")
     assert colour.verdict == "not checkable" and "colours vary too much to tell" in colour.evidence
@@ -372,14 +352,8 @@ def test_what_was_not_compared_is_not_called_well(tmp_path: Path) -> None:
 
 def test_other_keys_are_looked_at_too(tmp_path: Path) -> None:
     """Touch and Go's own split: touches are apart, recordings are not."""
-
-    class Recorded(Presses):
-        def read(self, item: int) -> list[Sample]:
-            sample = super().read(item)[0]
-            day = {"recording": f"day {item // NUM_FRAMES // 5}"}
-            return [Sample(vision=sample.vision, touch=sample.touch, columns={**sample.columns, **day})]
-
-    own = check(Recorded(), tmp_path)["groups across splits"]
+    recorded = altered(Presses(), lambda _, item: {"recording": f"day {item // NUM_FRAMES // 5}"})
+    own = check(recorded, tmp_path)["groups across splits"]
     assert own.verdict == "look" and "recording: 4 of 4 in more than one split" in own.evidence
     assert "4 of 4 in test are also in train" in own.evidence
 
@@ -395,29 +369,20 @@ def test_resized_copies_in_another_pack_are_found(tmp_path: Path, objects: str) 
         own = 60 * weave + 40 * (dots < 0.3) * (obj // 3 % 2)
         return np.clip(gel(obj, k) + np.kron(own, np.ones((4, 4, 1))), 0, 255).astype(np.uint8)
 
-    class Seen(Presses):
-        def read(self, item: int) -> list[Sample]:
-            (sample,) = super().read(item)
-            return [replace(sample, touch=seen(*divmod(item, NUM_FRAMES)))]
-
-    class Renamed(Presses):
-        def spec(self) -> DataSpec:
-            return replace(super().spec(), name="renamed")
-
-        def read(self, item: int) -> list[Sample]:
-            obj, k = divmod(item, NUM_FRAMES)
-            (sample,) = super().read(item)
-            shown = obj + 100 if objects == "others" else (obj + 1) % NUM_OBJECTS
-            names = {"id": f"new {item}", "group": f"new {obj}", "touch_group": f"new {obj}", "sensor": "new"}
-            vision, touch = (
-                np.asarray(Image.fromarray(image).resize((48, 48), Image.Resampling.BICUBIC))
-                for image in (camera(shown, k), seen(shown, k))
-            )
-            return [replace(sample, vision=vision, touch=touch, columns={**sample.columns, **names})]
+    def renamed(_: Sample, item: int) -> dict[str, Any]:
+        obj, k = divmod(item, NUM_FRAMES)
+        shown = obj + 100 if objects == "others" else (obj + 1) % NUM_OBJECTS
+        names = {"id": f"new {item}", "group": f"new {obj}", "touch_group": f"new {obj}", "sensor": "new"}
+        vision, touch = (
+            np.asarray(Image.fromarray(image).resize((48, 48), Image.Resampling.BICUBIC))
+            for image in (camera(shown, k), seen(shown, k))
+        )
+        return {"vision": vision, "touch": touch, **names}
 
     one, other = (tmp_path / name for name in ("one", "other"))
-    build(Seen(), one, size=SIDE, quiet=True)
-    build(Renamed(), other, size=SIDE, quiet=True)
+    first = altered(Presses(), lambda _, item: {"touch": seen(*divmod(item, NUM_FRAMES))})
+    build(first, one, size=SIDE, quiet=True)
+    build(altered(Presses(), renamed, name="renamed"), other, size=SIDE, quiet=True)
     file = tmp_path / "found.json"
     assert main(["data", "check", str(one), str(other), "--json", str(file)]) in (0, 1)
     found = {f["item"]: f for f in json.loads(file.read_text())["findings"]}["near-copies across splits"]

@@ -13,6 +13,7 @@ from mvitac.data.checks.examine import examine
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Target, ValueTask
+from support.toy import with_columns
 
 NUM, LENGTH = 16, 40
 TEST = (3, 7, 11, 15)
@@ -107,13 +108,8 @@ def test_missing_values(tmp_path: Path) -> None:
 
 
 def test_a_stretch_of_zeros_is_no_contact(healthy: Pack) -> None:
-    pack = Pack(healthy.path)
-    force = pack.column("force_n")
-    force[:15] = 0
-    at = pack.table.column_names.index("force_n")
-    pack.table = pack.table.set_column(at, "force_n", [force])
-    assert "constant" not in value_checks.values(pack)[0].evidence
-    force[:15] = 1
-    pack = Pack(healthy.path)
-    pack.table = pack.table.set_column(at, "force_n", [force])
-    assert "constant" in value_checks.values(pack)[0].evidence
+    force = healthy.column("force_n")
+    for value in (0, 1):
+        force[:15] = value
+        found = value_checks.values(with_columns(healthy, force_n=force.copy()))[0]
+        assert ("constant" in found.evidence) == bool(value)
