@@ -235,10 +235,3 @@ def test_the_suite_shows_what_was_measured() -> None:
     images, poses = presses("edge", 0, 2, 0)
     assert images.mean() == pytest.approx(102.91, abs=0.05)
     assert np.allclose(poses, [[-3.011, -14.194], [-1.259, -3.834]], atol=1e-3)
-
-
-def test_latency_hurts(small: Servo) -> None:
-    long = replace(small, steps=40, settle=10, shapes=6, conditions=(Condition(name="a"),))
-    late = replace(long, conditions=(Condition(name="a", latency_ms=150),))
-    mm = [np.mean(score(each, Row("true pose", None, None))[2]["mm"]) for each in (long, late)]
-    assert mm[1] > 1.5 * mm[0]

@@ -25,7 +25,7 @@ def gel(tmp_path_factory: pytest.TempPathFactory) -> Pack:
     return built(Gel(num=60), tmp_path_factory.mktemp("gel") / "pack", size=24)
 
 
-def test_rows_are_those_of_the_parts(pack: Pack, gel: Pack) -> None:
+def test_rows_are_those_of_the_parts_together_and_alone(pack: Pack, gel: Pack) -> None:
     mix = MixedPack({"toy": pack, "gel": gel})
     assert (mix.num, mix.size) == (pack.num + gel.num, 32)
     assert mix.column("part").tolist() == ["toy"] * pack.num + ["gel"] * gel.num
@@ -45,6 +45,10 @@ def test_rows_are_those_of_the_parts(pack: Pack, gel: Pack) -> None:
     assert "gel: images of 24 px are resized to 32 px as they are read" in mix.spec.notes
     assert mix.spec.licence == "toy: none; gel: none"
     assert MixedPack({"toy": pack, "gel": gel}, size=16).images["touch"].shape[1:] == (16, 16, 3)
+    alone = mix.alone("gel")
+    np.testing.assert_array_equal(alone.rows("train"), pack.num + gel.rows("train"))
+    assert alone.spec.modalities == ("touch",) and mix.spec.modalities == ("vision", "touch")
+    assert len(mix.rows("train")) > len(gel.rows("train"))
 
 
 def test_the_digest_is_of_parts_and_size(pack: Pack, gel: Pack) -> None:
@@ -118,14 +122,6 @@ def test_windows_of_a_mix_stay_within_a_touch_of_a_part(measured: Pack, tmp_path
     mix = windowed(MixedPack({"a": measured, "b": other}), window)
     for rows, part in ((np.arange(measured.num), measured), (measured.num + np.arange(30), other)):
         np.testing.assert_array_equal(mix.images["touch"][rows], windowed(part, window).images["touch"][:])
-
-
-def test_one_part_alone(pack: Pack, gel: Pack) -> None:
-    mix = MixedPack({"toy": pack, "gel": gel})
-    alone = mix.alone("gel")
-    np.testing.assert_array_equal(alone.rows("train"), pack.num + gel.rows("train"))
-    assert alone.spec.modalities == ("touch",) and mix.spec.modalities == ("vision", "touch")
-    assert len(mix.rows("train")) > len(gel.rows("train"))
 
 
 class TurnedSlice(Turned, Slice):

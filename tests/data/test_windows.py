@@ -121,11 +121,6 @@ def test_windows_that_cannot_be_made(presses: Pack, options: dict[str, Any], mes
         windowed(presses, Window(**options))
 
 
-def test_frames_without_an_order_are_refused(pack: Pack) -> None:
-    with pytest.raises(ValueError, match="none of the columns frame, seq, time"):
-        windowed(pack, Window(frames=2))
-
-
 @pytest.mark.parametrize("temporal", ["stack", "mean"])
 def test_a_window_trains_probes_and_reloads(presses: Pack, tmp_path: Path, temporal: str) -> None:
     data = PackConfig(path=presses.path, num_frames=2)
@@ -173,7 +168,11 @@ def test_positives_can_be_near_in_time(presses: Pack, tmp_path: Path) -> None:
     train_twice(near, tmp_path, cut=3)
 
 
-def test_positives_near_in_time_that_cannot_be(presses: Pack, pack: Pack, tmp_path: Path) -> None:
+def test_frames_without_an_order_are_refused_and_positives_near_in_time_that_cannot_be(
+    presses: Pack, pack: Pack, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match="none of the columns frame, seq, time"):
+        windowed(pack, Window(frames=2))
     run = recipe("smoke", PackConfig(path=presses.path))
     with pytest.raises(ValueError, match="no effect on same-image positives"):
         replace(run, positives="same-image", positives_within=2.0)

@@ -277,16 +277,13 @@ def test_a_runs_own_classifier_answers_by_the_names_of_classes(pack: Pack) -> No
     assert own("waves", *names) == []  # it was never told of waves
 
 
-def test_runs_on_different_data_are_not_mixed(runs: list[Path], tmp_path: Path) -> None:
+def test_runs_of_other_data_and_settings_are_no_seeds_of_one_another(runs: list[Path], tmp_path: Path) -> None:
+    """Two temperatures are two lines, each by its folder; what the two seeds share is one."""
     other = toy_pack(tmp_path / "p", num=90)
     run = replace(recipe("smoke", PackConfig(path=other.path)), steps=1)
     path = train(run, tmp_path / "r", quiet=True)
     with pytest.raises(ValueError, match="trained on different data"):
         probe_runs([runs[0], path], ProbeConfig())
-
-
-def test_runs_of_other_settings_are_no_seeds_of_one_another(runs: list[Path], tmp_path: Path) -> None:
-    """Two temperatures are two lines, each by its folder; what the two seeds share is one."""
     run = load(runs[0]).run
     colder = train(replace(run, method=replace(run.method, temperature=0.5)), tmp_path / "colder", quiet=True)
     session = ProbeConfig(probes=("knn",), tasks=("pattern",), modalities=("touch",), controls=False)

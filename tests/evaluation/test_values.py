@@ -33,8 +33,10 @@ def drawn(num: int = 300, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.nda
     return y, y + rng.normal(0, (0.5, 1.5), (num, 2)), rng.integers(0, 12, num)
 
 
-def test_scores_are_those_of_scikit_learn_over_the_rows_that_were_measured() -> None:
+def test_scores_are_those_of_scikit_learn_without_a_group_and_over_the_rows_that_were_measured() -> None:
     y, guess, groups = drawn()
+    found = r2_without_each_group(score_values(y, guess, groups, POSE))
+    assert found == pytest.approx([r2_score(y[groups != g], guess[groups != g]) for g in range(12)])
     y[::3, 1] = np.nan
     record = score_values(y, guess, groups, POSE)
     for t, found in enumerate(record["targets"]):
@@ -46,12 +48,6 @@ def test_scores_are_those_of_scikit_learn_over_the_rows_that_were_measured() -> 
     assert record["r2"] == pytest.approx(np.mean([found["r2"] for found in record["targets"]]))
     assert record["num_test"] == len(y)
     json.dumps(record, allow_nan=False)
-
-
-def test_r2_without_a_group_is_that_of_the_other_rows() -> None:
-    y, guess, groups = drawn()
-    found = r2_without_each_group(score_values(y, guess, groups, POSE))
-    assert found == pytest.approx([r2_score(y[groups != g], guess[groups != g]) for g in range(12)])
 
 
 @pytest.mark.parametrize("unit", [1e-9, 1e9])
@@ -97,16 +93,12 @@ def test_ridge_finds_a_linear_relation_in_any_unit_and_skips_what_was_not_measur
     assert r2_score(y[300:], predict(x[300:])) > 0.999
 
 
-def test_alpha_is_chosen_on_the_held_out_rows() -> None:
+def test_alpha_is_chosen_on_the_held_out_rows_by_squared_error() -> None:
     rng = np.random.default_rng(0)
     x = rng.normal(size=(80, 60))
     y = x[:, :1] + rng.normal(0, 3, (80, 1))  # noise: weak regularisation overfits
     memorised = np.concatenate([x[:60], x[:20]]), np.concatenate([y[:60], y[:20]])  # held out rows that were learned
     assert fit_ridge(x, y, 20)[1][0] > fit_ridge(*memorised, 20)[1][0]
-
-
-def test_alpha_is_chosen_by_squared_error_where_r2_says_nothing() -> None:
-    rng = np.random.default_rng(0)
     x, y = rng.normal(size=(80, 60)), rng.normal(2, 1, (80, 1))  # nothing to learn
     y[60:] = 2.0  # one value in the rows it is chosen on: R2 is 0 for all alphas
     assert fit_ridge(x, y, 20)[1][0] >= 1e3

@@ -9,7 +9,6 @@ import signal
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,14 +72,11 @@ def test_every_row_of_every_plan_is_a_run(name: str, recipe_name: str) -> None:
             assert found == (tuple(value) if isinstance(value, list) else value), (row.label, field)
 
 
-def test_table1_has_one_budget(pack: Pack, tmp_path: Path) -> None:
+def test_table1_has_one_budget_and_ablation_leaves_out_what_changes_nothing(pack: Pack, tmp_path: Path) -> None:
     work = lay_out(small(pack, rows=TABLE1.rows), pack, tmp_path, ProbeConfig())
     assert set(work.left_out) == {"TAG (CMC), its own tau .07"} and len(work.jobs) == 32  # smoke changes no tau
     assert {(job.run.steps, job.run.batch_size, job.run.optim.lr) for job in work.jobs} == {(4, 16, 2e-3)}
     assert [job.run.seed for job in work.jobs] == [0] * 16 + [1] * 16
-
-
-def test_ablation_leaves_out_what_changes_nothing(pack: Pack, tmp_path: Path) -> None:
     work = lay_out(small(pack, rows=ABLATION.rows), pack, tmp_path, ProbeConfig())
     assert "no grayscale" in work.left_out and "the same run as 'MViTac'" in work.left_out["no grayscale"]
     assert "grayscale .2" not in work.left_out
@@ -395,7 +391,9 @@ def test_tables_say_where_pairs_are_from(done: tuple[Path, dict], pack: Pack) ->
         assert f"| {other} |" in text
 
 
-def test_cost_counts_images_and_seconds(done: tuple[Path, dict], pack: Pack) -> None:
+def test_cost_counts_images_and_seconds_and_notes_of_the_data_stand_beside_it(
+    done: tuple[Path, dict], pack: Pack
+) -> None:
     out, result = done
     by_row = {c["row"]: c for c in result["cost"]}
     assert by_row["MViTac"]["images"] == 4 * 16 * 2 * 2 and by_row["supervised, touch"]["images"] == 4 * 16
@@ -403,6 +401,11 @@ def test_cost_counts_images_and_seconds(done: tuple[Path, dict], pack: Pack) -> 
     assert all(0 < c["seconds"] < 60 for c in result["cost"])
     work = lay_out(small(pack), pack, out, ProbeConfig())
     assert cost("MViTac", work.jobs[:1], pack)["trained_parameters"] > 100_000
+    noted = with_columns(pack, spec=replace(pack.spec, notes=("half of it\nis the same",)))
+    result = gather(replace(work, pack=noted), out, ProbeConfig())
+    lines = lines_of(result)
+    assert "\nNote: half of it is the same.\n" in markdown(result, lines)
+    assert latex(result, lines).splitlines()[1] == "% Note: half of it is the same."
 
 
 def test_a_leak_of_a_tasks_own_split_is_flagged(pack: Pack) -> None:
@@ -413,17 +416,6 @@ def test_a_leak_of_a_tasks_own_split_is_flagged(pack: Pack) -> None:
     said = own.split_leaks([pattern, task])
     assert said == {"split_bright": "30 of 30 test instances of bright are also in train: this split leaks"}
     assert own.split_leaks([pattern]) == {}  # nothing that is scored
-
-
-def test_what_must_be_said_beside_every_result_is(done: tuple[Path, dict], pack: Pack) -> None:
-    out, result = done
-    work = lay_out(small(pack), pack, out, ProbeConfig())
-    noted = copy(pack)
-    noted.spec = replace(pack.spec, notes=("half of it\nis the same",))
-    result = gather(replace(work, pack=noted), out, ProbeConfig())
-    lines = lines_of(result)
-    assert "\nNote: half of it is the same.\n" in markdown(result, lines)
-    assert latex(result, lines).splitlines()[1] == "% Note: half of it is the same."
 
 
 def test_names_and_units_are_text_in_latex_and_markdown() -> None:

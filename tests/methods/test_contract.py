@@ -18,7 +18,7 @@ from mvitac.recipes import with_method
 from mvitac.registry import default, from_json, to_json
 from mvitac.run import Optim
 from mvitac.training.step import build_optimiser
-from support.small_methods import TINY_VIT, build, outcome, small, views
+from support.small_methods import TINY_VIT, build, outcome, views
 from support.toy import Toy
 from support.training_runs import smoke, train_twice
 
@@ -110,12 +110,6 @@ def test_one_modality_works_or_is_refused(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_survives_its_record(name: str) -> None:
-    config = small(name)
-    assert from_json(MethodConfig, json.loads(json.dumps(to_json(config)))) == config
-
-
-@pytest.mark.parametrize("name", NAMES)
 def test_resumed_equals_straight_and_loads(pack: Pack, tmp_path: Path, name: str) -> None:
     """Cut after step 3 of 4 and resumed: queues, banks and their constants come back with the weights."""
     run = with_method(smoke(pack, steps=4, checkpoint_every=2, eval_every=0), name)
@@ -127,12 +121,13 @@ def test_resumed_equals_straight_and_loads(pack: Pack, tmp_path: Path, name: str
     assert set(model.encoders) == {"vision", "touch"}
 
 
-def test_a_recipe_changes_every_method_alike(pack: Pack) -> None:
+def test_a_recipe_changes_every_method_alike_and_each_survives_its_record(pack: Pack) -> None:
     """smoke asks for narrow heads (32, 16): so do the methods that have them; the rest keeps its own defaults."""
     run = smoke(pack)
     for name in NAMES:
         method = with_method(run, name).method
         assert method.name == name
+        assert from_json(MethodConfig, json.loads(json.dumps(to_json(method)))) == method
         usual = default(MethodConfig, name)
         for field, value in {"hidden": 32, "out": 16}.items():
             assert getattr(method, field, value) == value

@@ -59,15 +59,6 @@ def test_each_view_passes_each_encoder_once() -> None:
     assert sorted(calls) == ["key touch", "key vision", "query touch", "query vision"]
 
 
-def test_keys_start_as_copies() -> None:
-    method = built()
-    for modality, tower in method.query.items():
-        key = method.key[modality].module.state_dict()
-        assert key.keys() == tower.state_dict().keys()
-        for name, value in tower.state_dict().items():
-            assert torch.equal(key[name], value), name
-
-
 def test_no_key_parameter_is_optimised_or_gets_a_gradient() -> None:
     method = built()
     optimiser = build_optimiser(Optim(), method, Encoders())

@@ -14,7 +14,7 @@ from torch import nn
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, build_trunk, sin_cos_positions
 from mvitac.nn.folded import folded
 from mvitac.nn.losses import info_nce
-from mvitac.nn.small_conv import SmallMapConv2d, _Product, use_convolutions, use_products
+from mvitac.nn.small_conv import _Product, use_convolutions, use_products
 from mvitac.nn.vit import encode_visible, patches, row_uniform
 from support.small_methods import slow_info_nce
 
@@ -72,21 +72,14 @@ def test_equals_the_convolution_and_its_gradients(
     assert type(use_convolutions(nn.Sequential(ours)).get_submodule("0")) is type(theirs)
 
 
-def layer() -> SmallMapConv2d:
-    conv = nn.Conv2d(5, 7, 3, padding=1, bias=False)
-    return use_products(nn.Sequential(conv)).to(memory_format=torch.channels_last)[0]  # type: ignore[index, return-value]
-
-
-def test_gradients_have_the_weights_layout() -> None:
-    conv = layer()
-    conv(torch.randn(4, 5, 2, 2).to(memory_format=torch.channels_last)).square().sum().backward()
+def test_gradients_have_the_weights_layout_and_bf16_autocast_is_as_close_as_the_convolution() -> None:
+    conv = use_products(nn.Sequential(nn.Conv2d(5, 7, 3, padding=1, bias=False))).to(memory_format=torch.channels_last)[
+        0
+    ]  # type: ignore[index]
+    images = torch.randn(4, 5, 2, 2).to(memory_format=torch.channels_last)
+    conv(images).square().sum().backward()
     assert conv.weight.grad is not None
     assert conv.weight.grad.stride() == conv.weight.stride()  # the fused optimiser reads both as they lie in memory
-
-
-def test_bf16_autocast_is_as_close_as_the_convolution() -> None:
-    conv = layer()
-    images = torch.randn(4, 5, 2, 2).to(memory_format=torch.channels_last)
     want = F.conv2d(images, conv.weight, padding=1)
     with torch.autocast("cpu", torch.bfloat16):
         got = conv(images)

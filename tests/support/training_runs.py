@@ -1,11 +1,13 @@
 """Short runs on the striped pairs: the smoke recipe, training that dies on the way, weights compared bit for bit."""
 
+import json
 import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -59,6 +61,10 @@ def views_by(feed: type[ImageLoader], run: Run, pack: Pack, rows: np.ndarray, nu
 
 def weights(path: Path) -> dict[str, torch.Tensor]:
     return safetensors.torch.load_file(path / "model.safetensors")
+
+
+def log_of(run: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
 
 
 def assert_equal_weights(a: Path, b: Path) -> None:

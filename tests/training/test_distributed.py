@@ -1,6 +1,5 @@
 """Two processes (gloo) against one on the joint batch: gradients, weights, statistics, files, resuming."""
 
-import json
 import socket
 from functools import partial
 from itertools import chain
@@ -20,6 +19,7 @@ from mvitac.training.step import Step
 from support.distributed_steps import METHODS, build, main, run_of, third_step, three_steps
 from support.processes import begin
 from support.small_steps import assert_close, views
+from support.training_runs import log_of
 
 pytestmark = pytest.mark.slow
 
@@ -83,8 +83,7 @@ def test_the_loop_shares_rows_writes_once_and_resumes_bit_for_bit(pack: Pack, tm
     a, b = (safetensors.torch.load_file(path / "model.safetensors") for path in (straight, cut))
     assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
     for path in (straight, cut):
-        lines = [json.loads(line) for line in (path / "log.jsonl").read_text().splitlines()]
-        assert [line["step"] for line in lines if "loss" in line] == [1, 2, 3, 4]
+        assert [line["step"] for line in log_of(path) if "loss" in line] == [1, 2, 3, 4]
     first, second = (torch.load(tmp_path / f"straight-rows{r}.pt") for r in (0, 1))
     epoch = [[*chain(*rows)] for rows in (first[:3], second[:3])]  # 60 training rows: three batches of 16 per epoch
     assert len(set(epoch[0])) == len(set(epoch[1])) == 24 and not set(epoch[0]) & set(epoch[1])

@@ -1,6 +1,5 @@
 """The loop: resumed = straight bit for bit, batches without near-duplicates, a loss that stops when it is no number."""
 
-import json
 import os
 import random
 import shutil
@@ -34,7 +33,7 @@ from mvitac.training.validation import validate
 from mvitac.transforms.random_views import Augment
 from support.processes import begin, finish
 from support.toy import toy_pack
-from support.training_runs import assert_equal_weights, batches, power_cut, smoke, stopped_at_four, views_by
+from support.training_runs import assert_equal_weights, batches, log_of, power_cut, smoke, stopped_at_four, views_by
 
 
 def test_leaves_the_promised_files(smoke_run: Path) -> None:
@@ -42,7 +41,7 @@ def test_leaves_the_promised_files(smoke_run: Path) -> None:
         *("run.json", "trained_on.safetensors", "log.jsonl", "checkpoint.pt", "model.safetensors"),
         "model.best.safetensors",
     }
-    lines = [json.loads(line) for line in (smoke_run / "log.jsonl").read_text().splitlines()]
+    lines = log_of(smoke_run)
     assert [line["step"] for line in lines if "loss" in line] == [2, 4, 6, 8]
     assert [line["step"] for line in lines if "eval" in line] == [0, 4, 8]
     for line in lines:
@@ -56,7 +55,7 @@ def test_stopped_and_resumed_equals_straight(pack: Pack, smoke_run: Path, tmp_pa
     run = cut_after(stop_after, pack, tmp_path / "r")
     train(run, tmp_path / "r", resume=True, quiet=True)
     assert_equal_weights(smoke_run, tmp_path / "r")
-    steps = [json.loads(line)["step"] for line in (tmp_path / "r" / "log.jsonl").read_text().splitlines()]
+    steps = [line["step"] for line in log_of(tmp_path / "r")]
     assert steps == sorted(steps) and steps.count(8) == 2  # one step line, one eval line, nothing twice
 
 
@@ -207,7 +206,7 @@ def test_learns_the_stripes(tmp_path: Path) -> None:
         for model in (fresh(run, pack.spec, pack.size), load(out))
     )
     assert all(end > start + 0.1 for start, end in zip(before, after, strict=True)), (before, after)
-    lines = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    lines = log_of(out)
     for part in ("vv", "tt", "vt", "tv"):
         assert lines[-2][part] < 0.9 * lines[1][part], part
 

@@ -1,6 +1,5 @@
 """Training on several packs: what is drawn, that a stop changes nothing, and losses of rows that lack a modality."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from mvitac.training.loader import ImageLoader
 from mvitac.training.loop import train
 from support.mixes import Gel, Slice, built, mix_run
 from support.small_methods import build, small
-from support.training_runs import assert_equal_weights, batches, smoke, train_twice, views_by
+from support.training_runs import assert_equal_weights, batches, log_of, smoke, train_twice, views_by
 
 MISSING = sorted(name for name, config in MethodConfig.choices.items() if config.takes_missing)
 PAIRED = ("cmc", "mct", "ssvtp")
@@ -70,8 +69,7 @@ def test_stopped_and_resumed_equals_straight(parts: dict[str, str], tmp_path: Pa
     given = (f"{parts['a']}:1", f"{parts['gel']}:2")
     run = mix_run(*given, steps=8, checkpoint_every=2, log_every=1)
     out = train_twice(run, tmp_path, cut=5)
-    lines = [json.loads(line) for line in (tmp_path / "straight" / "log.jsonl").read_text().splitlines()]
-    values = next(line["eval"] for line in reversed(lines) if "eval" in line)
+    values = next(line["eval"] for line in reversed(log_of(tmp_path / "straight")) if "eval" in line)
     shown = {"a vision/linear pattern", "a touch/linear a/bright", "a vision->touch R@5", "gel touch/linear pattern"}
     assert shown <= values.keys()
     assert not any(name.startswith("gel") and "vision" in name for name in values)

@@ -1,6 +1,5 @@
 """Validation while training: the start is the baseline, the best weights are kept, one sentence says how it ended."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +20,9 @@ from mvitac.system.files import read_json
 from mvitac.training import log, validation
 from mvitac.training.loop import train
 from mvitac.training.validation import Cells, validate, verdict
-from support.training_runs import power_cut, smoke
+from support.training_runs import log_of, power_cut, smoke
 
 LINEAR = tuple(f"{m}/linear {task}" for m in ("vision", "touch", "both") for task in ("pattern", "bright"))
-
-
-def log_of(run: Path) -> list[dict]:
-    return [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
 
 
 @pytest.fixture(scope="module")

@@ -65,6 +65,11 @@ def test_what_cannot_be_learned_is_an_error() -> None:
     both = np.stack([np.gradient(noise, axis=2), np.gradient(noise, axis=1)], axis=-1)
     with pytest.raises(ValueError, match="do not tell peaks from pits"):
         learn_colours(images(NEAR, both / both.std() / 4, 1))
+    # Stripes obey any law about how things change along them.
+    stripes = np.sin(np.arange(SIDE) + np.arange(8)[:, None])[:, None, :, None] * np.full((SIDE, 1, 3), 60.0)
+    for one_signal in (stripes, np.zeros((8, SIDE, SIDE, 3))):
+        with pytest.raises(ValueError, match="do not follow slopes"):
+            slope_colours(one_signal)
 
 
 def imprint(seed: int) -> np.ndarray:
@@ -87,12 +92,3 @@ def test_colours_of_exact_slopes() -> None:
     np.testing.assert_allclose(colours / factor, response, atol=2)
     np.testing.assert_allclose(mixtures.T @ colours, np.eye(2), atol=1e-6)
     assert np.abs(mixtures.T @ ink).max() < 0.03 * np.abs(mixtures.T @ response).max()
-
-
-def test_one_signal_is_not_two_slopes() -> None:
-    """Stripes obey any law about how things change along them."""
-    stripes = np.sin(np.arange(SIDE) + np.arange(8)[:, None])[:, None, :, None] * np.full((SIDE, 1, 3), 60.0)
-    with pytest.raises(ValueError, match="do not follow slopes"):
-        slope_colours(stripes)
-    with pytest.raises(ValueError, match="do not follow slopes"):
-        slope_colours(np.zeros((8, SIDE, SIDE, 3)))

@@ -35,11 +35,6 @@ def denormalise(view: torch.Tensor) -> torch.Tensor:
     return (sensors * std + mean).flatten(1, 2)
 
 
-def test_plain_view_is_the_normalised_image() -> None:
-    raw = images(side=32)
-    torch.testing.assert_close(denormalise(plain_view(raw, 32)), raw.float() / 255, atol=1e-6, rtol=0)
-
-
 @pytest.mark.parametrize("size", [24, 40, 56])
 @pytest.mark.parametrize("channels", [3, 6])
 def test_both_routes_replay_the_same_parameters(size: int, channels: int) -> None:
@@ -62,8 +57,9 @@ def test_views_are_rounded_to_bf16_once(route: Callable[..., torch.Tensor]) -> N
     assert torch.equal(exact.bfloat16(), rounded) and rounded.is_contiguous(memory_format=torch.channels_last)
 
 
-def test_flip_is_exact() -> None:
+def test_the_plain_view_is_the_normalised_image_and_a_flip_is_exact() -> None:
     raw, every = images(4, side=32), torch.ones(4, dtype=torch.bool)
+    torch.testing.assert_close(denormalise(plain_view(raw, 32)), raw.float() / 255, atol=1e-6, rtol=0)
     view = random_views.apply(raw, Drawn(torch.tensor([[0, 0, 32, 32]] * 4), every, ~every, torch.ones(4, 5)), 32)
     torch.testing.assert_close(denormalise(view), raw.flip(-1).float() / 255, atol=1e-6, rtol=0)
 
