@@ -123,8 +123,7 @@ def test_windows_that_cannot_be_made(presses: Pack, options: dict[str, Any], mes
 
 @pytest.mark.parametrize("temporal", ["stack", "mean"])
 def test_a_window_trains_probes_and_reloads(presses: Pack, tmp_path: Path, temporal: str) -> None:
-    data = PackConfig(path=presses.path, num_frames=2)
-    run = recipe("smoke", data)
+    run = recipe("smoke", PackConfig(path=presses.path, num_frames=2))
     run = replace(run, steps=2, batch_size=8, eval_every=0, augment=Augment(size=16))
     run = replace(run, encoder=run.encoder.changed(temporal=temporal))
     out = train(run, tmp_path / "run", quiet=True)

@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pytest
 import torch
 from PIL import Image
@@ -563,9 +562,8 @@ def test_groups_are_tested_once_in_own_splits(two_folds: Path, tmp_path: Path, m
 
     def with_own_split(self: DatasetConfig, *, quiet: bool = False) -> Pack:
         pack = real(self, quiet=quiet)
-        pack.table = pack.table.append_column("mine", pa.array(["train", "test"] * 20))
-        pack.spec = replace(pack.spec, tasks=(replace(pack.spec.tasks[0], split="mine"),))
-        return pack
+        spec = replace(pack.spec, tasks=(replace(pack.spec.tasks[0], split="mine"),))
+        return with_columns(pack, spec=spec, mine=["train", "test"] * 20)
 
     monkeypatch.setattr(type(plan.data), "open", with_own_split)
     with pytest.raises(ValueError, match=r"both test object '1' \(column mine\): each group must be tested once"):

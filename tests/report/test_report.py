@@ -19,7 +19,6 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Task
-from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.deploy.publish import publish
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs, stored_result
@@ -29,7 +28,6 @@ from mvitac.evaluation.scores import summarise
 from mvitac.experiments.table import lines_of
 from mvitac.experiments.table_formats import latex, markdown
 from mvitac.methods.supervised import SupervisedConfig
-from mvitac.recipes import recipe
 from mvitac.report import figures
 from mvitac.report.galleries import nearest_rows, spread
 from mvitac.report.report import write_report
@@ -37,6 +35,7 @@ from mvitac.report.tables import retrieval_rows
 from mvitac.run import Run
 from mvitac.system.files import read_json, write_json
 from mvitac.training.loop import train
+from support import training_runs
 from support.pages import drawings
 from support.small_plans import compared
 
@@ -100,8 +99,8 @@ class Noise(Source):
 
 
 def smoke(pack: Pack, **changes: Any) -> Run:
-    run = recipe("smoke", PackConfig(path=pack.path))
-    return replace(run, augment=replace(run.augment, size=16), batch_size=8, steps=2, log_every=1, **changes)
+    run = training_runs.smoke(pack, batch_size=8, steps=2, log_every=1, **changes)
+    return replace(run, augment=replace(run.augment, size=16))
 
 
 @pytest.fixture(scope="session")

@@ -14,14 +14,12 @@ from matplotlib.figure import Figure
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
-from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.score_text import cell_text
 from mvitac.evaluation.scores import summarise, summarise_again
 from mvitac.experiments import table_formats
 from mvitac.experiments.table import lines_of, target_lines
-from mvitac.recipes import recipe
 from mvitac.report import figures
 from mvitac.report.report import write_report
 from mvitac.report.tables import print_summary
@@ -30,6 +28,7 @@ from mvitac.training.loop import train
 from support.pages import drawings
 from support.small_plans import compared
 from support.toy import Toy, altered
+from support.training_runs import smoke
 
 
 def one_tested(sample: Sample, item: int) -> dict[str, Any]:
@@ -40,9 +39,8 @@ def one_tested(sample: Sample, item: int) -> dict[str, Any]:
 
 def scored_run(folder: Path, source: Toy, **session: Any) -> tuple[Path, Pack, dict[str, Any]]:
     pack = build(source, folder / "pack", size=16, workers=1, quiet=True)
-    run = recipe("smoke", PackConfig(path=pack.path))
-    run = replace(run, augment=replace(run.augment, size=16), steps=2, eval_every=0, batch_size=8)
-    out = train(run, folder / "run", quiet=True)
+    run = smoke(pack, steps=2, eval_every=0, batch_size=8)
+    out = train(replace(run, augment=replace(run.augment, size=16)), folder / "run", quiet=True)
     return out, pack, probe_runs([out], ProbeConfig(**session))
 
 

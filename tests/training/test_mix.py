@@ -155,13 +155,7 @@ def test_a_method_that_needs_whole_pairs_names_the_rows(parts: dict[str, str], n
     train(whole, tmp_path / "whole", quiet=True)
 
 
-def test_supervised_on_touch_takes_parts_without_a_camera(parts: dict[str, str]) -> None:
-    config = SupervisedConfig(modalities=("touch",), tasks=("pattern",))
-    pack = mix_run(parts["a"], parts["gel"]).data.open()
-    assert np.array_equal(config.training_rows(pack), pack.rows("train", "val"))
-
-
-def test_rows_without_a_loss_are_not_drawn(parts: dict[str, str], tmp_path: Path) -> None:
+def test_rows_without_a_loss_are_not_drawn_and_those_with_one_are(parts: dict[str, str], tmp_path: Path) -> None:
     run = mix_run(parts["a"], parts["gel"])
     pack = run.data.open()
     assert isinstance(pack, MixedPack)
@@ -169,6 +163,8 @@ def test_rows_without_a_loss_are_not_drawn(parts: dict[str, str], tmp_path: Path
     for losses, num in cases:
         rows = MViTacConfig(losses=losses).training_rows(pack)
         assert set(pack.part_of[rows]) == set(range(num))
+    by_touch = SupervisedConfig(modalities=("touch",), tasks=("pattern",))
+    assert np.array_equal(by_touch.training_rows(pack), pack.rows("train", "val"))
     with pytest.raises(ValueError, match="method 'mvitac' learns from no row of part gel: leave it out"):
         train(replace(run, method=MViTacConfig(losses=("vv",))), tmp_path / "run", quiet=True)
 

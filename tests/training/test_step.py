@@ -13,7 +13,6 @@ from mvitac.methods.base import Method, MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.nn.encoders import Encoders, draws_random_numbers
-from mvitac.recipes import recipe
 from mvitac.registry import default
 from mvitac.run import Optim, Run
 from mvitac.system import threads as system_threads
@@ -21,6 +20,7 @@ from mvitac.training.loop import train
 from mvitac.training.step import Step
 from support.small_methods import TINY_VIT, small
 from support.small_steps import RUN, assert_close, build, gradients, split, views
+from support.training_runs import smoke
 
 CPU = torch.device("cpu")
 
@@ -108,11 +108,9 @@ def test_gradient_caching_is_exact_with_batchnorm_and_dropout_chunk_by_chunk() -
 
 
 def test_impossible_steps_are_named(pack: Pack, tmp_path: Path) -> None:
-    from mvitac.datasets.pack import PackConfig
-
     with pytest.raises(ValueError, match="chunk 5: give a divisor of batch_size 16"):
         replace(RUN, chunk=5)
-    run = replace(recipe("smoke", PackConfig(path=pack.path)), chunk=4, method=SupervisedConfig())
+    run = smoke(pack, chunk=4, method=SupervisedConfig())
     with pytest.raises(ValueError, match="'supervised' supports neither several processes nor --chunk"):
         train(run, tmp_path / "r", quiet=True)
 
