@@ -11,7 +11,7 @@ import mvitac
 from mvitac.data.pack import Pack
 from mvitac.deploy.export_module import ExportModule
 from mvitac.evaluation import features
-from mvitac.evaluation.controls import frozen_trunks
+from mvitac.evaluation.controls import _untrained, frozen_trunks
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
@@ -136,6 +136,15 @@ def test_features_of_all_stages() -> None:
     ((_, control),) = frozen_trunks([recipe("locked")])  # of both senses, as the run has them of one
     assert {control.encoder[m].pool for m in ("vision", "touch")} == {"stages"}
     assert torch.equal(other.state_dict()["conv1.0.weight"], within(trunk).state_dict()["conv1.0.weight"])
+
+
+def test_the_untrained_control_keeps_a_locked_tower(pack: Pack, file: Path) -> None:
+    """It is the run before its first step, so the gain by both senses is that of training."""
+    run = started(pack, file, locked=True)
+    kept, fresh = _untrained(run).encoder, _untrained(started(pack, file)).encoder
+    assert kept.vision == run.encoder.vision and {kept.touch.weights, fresh.vision.weights} == {SCRATCH}
+    lost = replace(run, encoder=replace(run.encoder, vision=replace(run.encoder.vision, weights="gone.pt")))
+    assert _untrained(lost).encoder.vision.weights == SCRATCH
 
 
 def test_a_momentum_copy_shares_a_locked_trunk() -> None:

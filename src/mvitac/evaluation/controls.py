@@ -6,6 +6,7 @@ Controls are the most common class, raw pixels, the image border, the dataset's 
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -83,7 +84,7 @@ def controls_of(
     with work("fitting probes of the controls", num, "probes"):
         records += pixel_controls(pack, tasks, modalities)
         # Built one by one: threads would share the random generator.
-        models = [fresh(run.fresh(), spec, pack.size) for run, spec in starts]
+        models = [fresh(_untrained(run), spec, pack.size) for run, spec in starts]
         retrieval: Records = []
         scored = in_threads(lambda model: (probed(model), cross_modal(model, pack)), models)
         for (run, _), (found, ranked) in zip(starts, scored, strict=True):
@@ -94,6 +95,16 @@ def controls_of(
             which = [m for m in modalities if all(run.encoder[own].weights != SCRATCH for own in names_in(m, pack))]
             records += _named(name, None, probed(fresh(run, pack.spec, pack.size), which))
     return records, retrieval
+
+
+def _untrained(run: Run) -> Run:
+    """``run`` from random weights; a locked tower, which is not trained, has its own if they are here."""
+
+    def is_there(config: EncoderConfig) -> bool:
+        return bool(imagenet.source(config.trunk)) if config.weights == IMAGENET else Path(config.weights).is_file()
+
+    kept = {m: run.encoder[m] for m in MODALITIES if run.encoder[m].locked and is_there(run.encoder[m])}
+    return replace(run, encoder=replace(run.encoder.fresh(), **kept))
 
 
 def _named(source: str, seed: int | None, found: Records) -> Records:

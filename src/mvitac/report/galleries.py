@@ -18,9 +18,11 @@ NUM_ROWS, NUM_QUERIES, NUM_FOUND = 1500, 8, 5
 def nearest_rows(values: np.ndarray, groups: np.ndarray, num: int = NUM_FOUND) -> np.ndarray:
     """Of each of N rows, its nearest row by cosine of ``values`` [N, D] in each of the ``num`` nearest other ``groups``."""
     alike = np.where(groups[:, None] == groups, -np.inf, unit(values) @ unit(values).T)
-    order = np.argsort(-alike, axis=1, kind="stable")
-    firsts = (np.sort(np.unique(groups[row], return_index=True)[1])[:num] for row in order)  # the own group is last
-    return np.stack([row[first] for row, first in zip(order, firsts, strict=True)])
+    names, number = np.unique(groups, return_inverse=True)
+    members = [np.flatnonzero(number == k) for k in range(len(names))]
+    best = np.stack([own[alike[:, own].argmax(1)] for own in members], axis=1)  # [N, groups]
+    found = np.take_along_axis(alike, best, axis=1)
+    return np.take_along_axis(best, np.argsort(-found, axis=1, kind="stable")[:, :num], axis=1)  # the own group is last
 
 
 def spread(values: np.ndarray, num: int) -> np.ndarray:
