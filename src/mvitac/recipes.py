@@ -9,7 +9,7 @@ from mvitac.datasets.pack import PackConfig
 from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders
-from mvitac.registry import default, unknown
+from mvitac.registry import check_known, default
 from mvitac.run import Optim, Run
 from mvitac.transforms.random_views import Augment, ViewAugment
 
@@ -186,8 +186,7 @@ def recipe(name: str, data: DatasetConfig | Pack | None = None, phased: bool | N
         >>> recipe("quick").data.name
         'materials'
     """
-    if name not in RECIPES:
-        raise unknown("recipe", name, RECIPES)
+    check_known("recipe", [name], RECIPES)
     if isinstance(data, Pack):
         data, phased = PackConfig(path=data.path), data.phased if phased is None else phased
     data = data or default(DatasetConfig, "materials")

@@ -49,6 +49,13 @@ def unknown(what: str, given: str, allowed: typing.Iterable[str]) -> ValueError:
     return ValueError(f"unknown {what} {given!r}: choose from {', '.join(allowed)}{hint}")
 
 
+def check_known(what: str, given: typing.Iterable[str], allowed: typing.Collection[str]) -> None:
+    """Raise ``unknown`` for the first of ``given`` that is not among ``allowed``."""
+    for name in given:
+        if name not in allowed:
+            raise unknown(what, name, allowed)
+
+
 def check_range(config: object, low: float, high: float, *names: str) -> None:
     """ValueError unless the numbers ``names`` of ``config`` are finite and from ``low`` to ``high``."""
     for name in names:
@@ -59,8 +66,7 @@ def check_range(config: object, low: float, high: float, *names: str) -> None:
 def find(kind: type[T], name: str) -> type[T]:
     """Return the class registered under ``name``; the ValueError for an unknown name lists the choices."""
     choices = kind.choices  # type: ignore[attr-defined]
-    if name not in choices:
-        raise unknown(kind.__name__.removesuffix("Config").lower(), name, choices)
+    check_known(kind.__name__.removesuffix("Config").lower(), [name], choices)
     return choices[name]
 
 
@@ -126,9 +132,7 @@ def _dataclass_from_json(cls: type, given: dict[str, Any], where: str) -> Any:
             raise ValueError(f"{where}.name: expected one of {', '.join(cls.choices)}, got {name!r}")
         cls = find(cls, name)
     names, hints = sorted(field.name for field in dataclasses.fields(cls)), typing.get_type_hints(cls)  # type: ignore[arg-type]
-    for key in given:
-        if key not in names:
-            raise unknown(f"field in {where}", key, names)
+    check_known(f"field in {where}", given, names)
     none, required = dataclasses.MISSING, [f for f in dataclasses.fields(cls) if f.name not in given]  # type: ignore[arg-type]
     if missing := [f.name for f in required if f.default is none and f.default_factory is none]:
         raise ValueError(f"{where}: give {', '.join(missing)}, too")

@@ -22,7 +22,7 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.table.splits import folds
 from mvitac.evaluation.probe import VALUE_PROBES
 from mvitac.evaluation.probe_config import Probe
-from mvitac.registry import from_json, to_json, unknown
+from mvitac.registry import check_known, from_json, to_json, unknown
 from mvitac.system.files import brief, digest
 
 SUITES = Path(__file__).parent / "suites"
@@ -182,9 +182,7 @@ def open_set(one: SuiteSet, root: Path | None) -> Opened | str:
             made.append(_config(form, root or Path(), {**form.data, **form.score_on}).open())
         pack = JoinedPack(*made) if form.score_on else made[0]
         known = {task.name: task for task in pack.spec.all_tasks}
-        for asked in one.tasks:
-            if asked.name not in known:
-                raise unknown(f"task of {one.name}", asked.name, known)
+        check_known(f"task of {one.name}", (asked.name for asked in one.tasks), known)
         tasks = tuple((asked, known[asked.name]) for asked in one.tasks)
         packs = _fold(pack, one) if one.folds else (pack,)
         sides = zip(("", "scored "), made, strict=False)  # before the modalities of the data that is scored

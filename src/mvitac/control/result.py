@@ -24,7 +24,7 @@ from mvitac.control.suite import OWN, SHUFFLED, Row, rows_of, score
 from mvitac.control.video import film, webp
 from mvitac.evaluation.intervals import paired_difference
 from mvitac.model import Model
-from mvitac.registry import from_json, unknown
+from mvitac.registry import check_known, from_json
 from mvitac.report.html import blocks as page
 from mvitac.report.html import data_uri
 from mvitac.system.files import digest, fields_of, read_json, write_atomic
@@ -44,8 +44,7 @@ def shipped() -> list[str]:
 
 def find_suite(name: str) -> Suite:
     """The suite ``name`` of this version."""
-    if name not in shipped():
-        raise unknown("suite", name, shipped())
+    check_known("suite", [name], shipped())
     value = tomllib.loads((SUITES / f"{name}.toml").read_text())
     return from_json(Insert if value["kind"] == "insert" else Servo, value, "suite")
 

@@ -26,7 +26,7 @@ from mvitac.data.jpeg import Jpegs
 from mvitac.data.lazy import Lazy
 from mvitac.data.pack_table import check_table
 from mvitac.data.spec import PHASES, SUFFIXES, AnyTask, DataSpec, Store, ValueTask
-from mvitac.registry import from_json, unknown
+from mvitac.registry import check_known, from_json
 from mvitac.system.files import brief, digest, digest_file, read_json
 
 FORMAT, FORMAT_VERSION = "mvitac-pack", 2
@@ -99,8 +99,7 @@ class Pack:
 
     def column(self, name: str) -> np.ndarray:
         """Return a table column as numpy [N]; the ValueError for an unknown one lists the columns."""
-        if name not in self.table.column_names:
-            raise unknown("column", name, self.table.column_names)
+        check_known("column", [name], self.table.column_names)
         return np.array(self.table.column(name).to_numpy(zero_copy_only=False))  # arrow memory is read-only
 
     def labels(self, task: str, *splits: str) -> np.ndarray:
@@ -108,10 +107,9 @@ class Pack:
 
         With ``splits``, labels of rows in other splits (column ``Task.split``) are -1, too.
         """
-        if task not in (tasks := {t.name: t for t in self.spec.tasks}):
-            raise unknown("task", task, tasks)
-        about = tasks[task]
-        return self._known(about, splits, lambda: self.column(f"label_{task}").astype(np.int64), -1)
+        tasks = {t.name: t for t in self.spec.tasks}
+        check_known("task", [task], tasks)
+        return self._known(tasks[task], splits, lambda: self.column(f"label_{task}").astype(np.int64), -1)
 
     def values(self, task: ValueTask, *splits: str) -> np.ndarray:
         """Return float64 values [N, T] of the targets of ``task``; NaN if not measured or excluded by ``task.only``.

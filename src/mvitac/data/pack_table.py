@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 
 from mvitac.data.spec import DataSpec
-from mvitac.registry import unknown
+from mvitac.registry import check_known
 
 SPLITS = ("train", "val", "test", "unlabelled")
 """Pre-training uses train and unlabelled. Val is for choosing (kNN during training, a probe's C), test for scores only."""
@@ -18,9 +18,7 @@ def check_table(table: pa.Table, spec: DataSpec) -> None:
     controls = [c for columns in spec.controls.values() for c in columns]
     targets = {target.name: target for task in spec.values for target in task.targets}
     asked = (*labels, *controls, *targets, *(c for task in spec.all_tasks for c in task.only))
-    for name in ("id", "group", "split", *asked):
-        if name not in table.column_names:
-            raise unknown("column", name, table.column_names)
+    check_known("column", ("id", "group", "split", *asked), table.column_names)
     for name in ("id", "group", "split", "touch_group", *labels):
         if name in table.column_names and table.column(name).null_count:
             row = _first(table.column(name).is_null().to_numpy())
@@ -29,11 +27,8 @@ def check_table(table: pa.Table, spec: DataSpec) -> None:
         if name in table.column_names and (table.column(name).null_count or table.column(name).type != pa.bool_()):
             raise ValueError(f"column {name} holds {table.column(name).type}: write true or false in every row")
     for name in spec.split_columns:
-        if name not in table.column_names:
-            raise unknown("column", name, table.column_names)
-        for split in table.column(name).unique().to_pylist():
-            if split not in SPLITS:
-                raise unknown(name, str(split), SPLITS)
+        check_known("column", [name], table.column_names)
+        check_known(name, map(str, table.column(name).unique().to_pylist()), SPLITS)
     for name, num in labels.items():
         column = table.column(name)
         if not pa.types.is_integer(column.type):

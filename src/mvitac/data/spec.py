@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from mvitac.registry import unknown
+from mvitac.registry import check_known
 
 MODALITIES = ("vision", "touch")
 UNGROUPED = "so every row is its own group"  # is in the note of a table whose rows are their own groups
@@ -167,8 +167,7 @@ def check_request(store: str = "raw", **given: float) -> None:
         low, high = LIMITS[name]
         if not low <= value <= high:
             raise ValueError(f"{name} {value} is not possible: give {low} to {high}")
-    if store not in SUFFIXES:
-        raise unknown("store", str(store), SUFFIXES)
+    check_known("store", [str(store)], SUFFIXES)
 
 
 def stored_as(store: Store, quality: int) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from mvitac.data.images import difference
 from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Images, Pack
 from mvitac.data.spec import Window
-from mvitac.registry import unknown
+from mvitac.registry import check_known
 from mvitac.system.files import digest
 
 ORDER = ("frame", "seq", "time")  # columns that order the frames of a touch, by default the first that exists
@@ -34,9 +34,7 @@ def windowed(pack: Pack, window: Window) -> Pack:
         made = copy.copy(pack)
         made.spec = replace(pack.spec, window=replace(pack.spec.window, order=window.order))
         return made
-    for modality in window.of:
-        if modality not in pack.spec.modalities:
-            raise unknown("modality of windows", modality, pack.spec.modalities)
+    check_known("modality of windows", window.of, pack.spec.modalities)
     index, whole, first = frames_of(pack, window)
     kept: dict[str, list[str]] = {}
     for name in pack.spec.split_columns if window.short == "leave-out" else ():

@@ -24,7 +24,7 @@ from mvitac.evaluation.scores import per_class, pool, summarise
 from mvitac.evaluation.sensors import about_new, describe_statistics
 from mvitac.model import Model, Which, load, weights_file
 from mvitac.nn.encoders import build_trunk
-from mvitac.registry import from_json, to_json, unknown
+from mvitac.registry import check_known, from_json, to_json
 from mvitac.run import Run, load_run
 from mvitac.shipped import BASE, named
 from mvitac.system.files import check_place, digest_file, read_json, write_json
@@ -282,11 +282,7 @@ def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[AnyTask], list[str]]:
     if not known:
         what = f"dataset {pack.spec.name!r} has no labels and no values"
         raise ValueError(f"{what}: pack it with --labels or --values")
-    for name in session.tasks:
-        if name not in known:
-            raise unknown("task", name, known)
+    check_known("task", session.tasks, known)
     have = [*pack.spec.modalities, *["both"] * (len(pack.spec.modalities) == 2)]
-    for modality in session.modalities:
-        if modality not in have:
-            raise unknown("modality", modality, have)
+    check_known("modality", session.modalities, have)
     return [known[name] for name in session.tasks or known], list(session.modalities or have)

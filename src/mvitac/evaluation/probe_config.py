@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from mvitac.evaluation import few_labels
-from mvitac.registry import unknown
+from mvitac.registry import check_known
 
 Probe = Literal["linear", "paper", "knn"]
 Standardise = Literal["colours", "features"]
@@ -40,9 +40,7 @@ class ProbeConfig:
             for value in values:
                 if values.count(value) > 1:
                     raise ValueError(f"{name} {value!r} is given twice: give it once")
-        for probe in self.probes:
-            if probe not in get_args(Probe):
-                raise unknown("probe", probe, get_args(Probe))
+        check_known("probe", self.probes, get_args(Probe))
         if not self.probes:
             raise ValueError("no probe given: choose from linear, paper, knn")
         if self.folds < 0 or self.folds == 1 or (self.folds and self.standardise):

@@ -12,7 +12,7 @@ from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.probe_config import Probe
 from mvitac.methods.base import MethodConfig
 from mvitac.recipes import recipe, with_method
-from mvitac.registry import default, from_json, to_json, unknown
+from mvitac.registry import check_known, default, from_json, to_json, unknown
 from mvitac.run import Run
 from mvitac.system.files import brief, parse_json
 
@@ -83,15 +83,12 @@ class Plan:
             raise ValueError(f"row {taken[0]!r} has the name of a control: give it another label")
         if len({slug(label) for label in labels}) < len(labels):
             raise ValueError(f"plan {self.name!r}: two labels are one, but for case and punctuation: rename one")
-        if self.reference not in labels:
-            raise unknown("reference row", self.reference, labels)
+        check_known("reference row", [self.reference], labels)
 
     def only(self, labels: Sequence[str]) -> "Plan":
         """The plan with only these rows and the reference; all rows if none is given."""
         known = [row.label for row in self.rows]
-        for label in labels:
-            if label not in known:
-                raise unknown("row", label, known)
+        check_known("row", labels, known)
         wanted = {*labels, self.reference} if labels else set(known)
         return replace(self, rows=tuple(row for row in self.rows if row.label in wanted))
 

@@ -21,7 +21,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, DataSpec, Task
 from mvitac.methods.base import Method, MethodConfig, Views, with_sum
 from mvitac.nn.encoders import Encoders, build_trunk, features_of, num_features
-from mvitac.registry import check_range, unknown
+from mvitac.registry import check_known, check_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,18 +50,14 @@ class LabelledConfig(MethodConfig):
     def tasks_of(self, spec: DataSpec) -> tuple[AnyTask, ...]:
         """Tasks to learn; ValueError if the dataset lacks one, or has none."""
         known = {task.name: task for task in spec.all_tasks}
-        for task in self.tasks:
-            if task not in known:
-                raise unknown("task", task, known)
+        check_known("task", self.tasks, known)
         if not known:
             raise ValueError(f"dataset {spec.name!r} has no labels and no values: choose a self-supervised method")
         return tuple(known[name] for name in self.tasks) or spec.tasks or spec.values
 
     def modalities_of(self, spec: DataSpec) -> tuple[str, ...]:
         """The modalities to learn from, in the dataset's order; ValueError if the dataset lacks one."""
-        for modality in self.modalities:
-            if modality not in spec.modalities:
-                raise unknown("modality", modality, spec.modalities)
+        check_known("modality", self.modalities, spec.modalities)
         return tuple(m for m in spec.modalities if m in (self.modalities or spec.modalities))
 
     def without_idle(self, spec: DataSpec) -> Self:

@@ -12,7 +12,7 @@ from statistics import mean
 from typing import Any
 
 from mvitac.data.pack import Pack
-from mvitac.registry import to_json, unknown
+from mvitac.registry import check_known, to_json
 from mvitac.run import Run
 from mvitac.system.files import naming, parse_json, write_atomic
 from mvitac.system.progress import say, shown, work
@@ -182,8 +182,7 @@ def open_loggers(name: str | None, out: Path, run: Run) -> Iterator[tuple[Logger
     if name is None:
         yield ()
         return
-    if name not in LOGGERS:
-        raise unknown("logger", name, LOGGERS)
+    check_known("logger", [name], LOGGERS)
     try:
         library = importlib.import_module("torch.utils.tensorboard" if name == "tensorboard" else name)
     except ImportError:
