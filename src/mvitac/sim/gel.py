@@ -30,6 +30,7 @@ MEMBRANE_MM = (0.12, 0.35, 0.9)
 """Radii over which the membrane bridges gaps (set by eye, from the halo around real imprints)."""
 MEMBRANE_SAG = 0.8
 """Relative height of the bridge: the gel behind pushes the membrane into the gap, so shallow grooves remain visible."""
+Rng = np.random.Generator
 _TAG = 0x6E1
 
 
@@ -91,7 +92,7 @@ def contact(pressed: F, *, pixel_mm: float) -> dict[str, float]:
 def render(
     imprint_mm: F,
     sensor: Sensor,
-    rng: np.random.Generator,
+    rng: Rng,
     *,
     pixel_mm: float,
     unit: int,
@@ -133,9 +134,7 @@ def area_resize(picture: F, height: int, width: int) -> F:
     return np.einsum("hH,HWc->hWc", rows, picture, optimize=True).transpose(0, 2, 1).dot(columns.T).transpose(0, 2, 1)
 
 
-def _illuminate(
-    imprint: F, sensor: Sensor, copy: np.random.Generator, paint: np.random.Generator, pixel_mm: float, gain: float
-) -> F:
+def _illuminate(imprint: F, sensor: Sensor, copy: Rng, paint: Rng, pixel_mm: float, gain: float) -> F:
     """Return float levels [H, W, 3]: light without contact, plus the response to slope, minus shadows of ridges."""
     u, v = _axes_unit(imprint.shape)
     # paint is uneven: a faint grain of slope; each copy has its own LED balance and a slightly shifted glow
@@ -160,9 +159,7 @@ def _illuminate(
     return picture
 
 
-def _measured(
-    imprint: F, sensor: Sensor, copy: np.random.Generator, paint: np.random.Generator, pixel_mm: float, gain: float
-) -> F:
+def _measured(imprint: F, sensor: Sensor, copy: Rng, paint: Rng, pixel_mm: float, gain: float) -> F:
     """Return float levels [H, W, 3] of a real gel. A copy has its own LED balance and field of view on that gel."""
     gy, gx = np.gradient(imprint, np.float32(pixel_mm))
     balance = copy.normal(1.0, 0.05, 3) * copy.normal(1.0, 0.04)
@@ -182,9 +179,7 @@ def _shadow(imprint: F, towards: Pair, pixel_mm: float) -> F:
     return 1 - np.exp(blocked * np.float32(-4.0))
 
 
-def _draw_markers(
-    picture: F, imprint: F, sensor: Sensor, copy: np.random.Generator, pixel_mm: float, shear_mm: Pair
-) -> None:
+def _draw_markers(picture: F, imprint: F, sensor: Sensor, copy: Rng, pixel_mm: float, shear_mm: Pair) -> None:
     """Draw the dots into levels [H, W, 3] in place. They move with the gel, so contact drags and spreads them."""
     x, y = _axes_mm(imprint.shape, pixel_mm)
     push = _blur(imprint, 0.8 / pixel_mm)
@@ -226,7 +221,7 @@ def _disc(square: F, soft: F | np.float32) -> F:
     return np.clip((1 - np.sqrt(np.maximum(square, 0))) / (2 * soft) + np.float32(0.5), 0, 1)
 
 
-def _soil(picture: F, sensor: Sensor, copy: np.random.Generator, pixel_mm: float) -> None:
+def _soil(picture: F, sensor: Sensor, copy: Rng, pixel_mm: float) -> None:
     """Add dirt, scratches and the lens edge to levels [H, W, 3] in place."""
     h, w = picture.shape[:2]
     x, y = _axes_mm((h, w), pixel_mm)
@@ -277,8 +272,7 @@ def grid(size: int, width_mm: float) -> tuple[F, F, float]:
 def _axes_mm(shape: tuple[int, ...], pixel_mm: float) -> tuple[F, F]:
     """Return x [1, W] and y [H, 1] in mm from the centre of the picture."""
     h, w = shape
-    x = (np.arange(w, dtype=np.float32) - (w - 1) / 2) * np.float32(pixel_mm)
-    y = (np.arange(h, dtype=np.float32) - (h - 1) / 2) * np.float32(pixel_mm)
+    x, y = ((np.arange(n, dtype=np.float32) - (n - 1) / 2) * np.float32(pixel_mm) for n in (w, h))
     return x[None], y[:, None]
 
 
@@ -286,8 +280,7 @@ def _axes_mm(shape: tuple[int, ...], pixel_mm: float) -> tuple[F, F]:
 def _axes_unit(shape: tuple[int, ...]) -> tuple[F, F]:
     """Return u [1, W] and v [H, 1], both from -1 to 1."""
     h, w = shape
-    u = (np.arange(w, dtype=np.float32) + 0.5) * np.float32(2 / w) - 1
-    v = (np.arange(h, dtype=np.float32) + 0.5) * np.float32(2 / h) - 1
+    u, v = ((np.arange(n, dtype=np.float32) + 0.5) * np.float32(2 / n) - 1 for n in (w, h))
     return u[None], v[:, None]
 
 

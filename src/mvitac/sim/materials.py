@@ -157,10 +157,7 @@ def touch(
         **pressed,
         "stiffness": thing.stiffness,
         "amplitude_mm": thing.amplitude_mm,
-        "wavelength_mm": thing.feel.wavelength_mm,
-        "anisotropy": thing.feel.anisotropy,
-        "irregularity": thing.feel.irregularity,
-        "asperity": thing.feel.asperity,
+        **{name: getattr(thing.feel, name) for name in ("wavelength_mm", "anisotropy", "irregularity", "asperity")},
         "gloss": thing.gloss,
         "angle_rad": angle,
     }

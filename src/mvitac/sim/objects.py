@@ -30,7 +30,7 @@ CLUTTER = (("box", ".03 .02 .04"), ("sphere", ".028"), ("cylinder", ".022 .045")
 class Part:
     """One primitive of an object, in the object's frame."""
 
-    shape: str  # MuJoCo geom type: box, cylinder, capsule, ellipsoid or sphere
+    shape: str  # MuJoCo geom type: box, cylinder, capsule or ellipsoid
     size: tuple[float, ...]  # MuJoCo half sizes in metres
     center: tuple[float, float, float]
     lying: bool = False  # whether the geom's axis is y instead of z
@@ -40,8 +40,6 @@ class Part:
         """Return the half extents [3] of the axis-aligned box around the part."""
         if self.shape in ("box", "ellipsoid"):
             return np.array(self.size)
-        if self.shape == "sphere":
-            return np.full(3, self.size[0])
         radius, half = self.size
         half += radius if self.shape == "capsule" else 0.0
         return np.array([radius, half, radius] if self.lying else [radius, radius, half])
@@ -52,8 +50,6 @@ class Part:
             return 8 * float(np.prod(self.size))
         if self.shape == "ellipsoid":
             return 4 / 3 * np.pi * float(np.prod(self.size))
-        if self.shape == "sphere":
-            return 4 / 3 * np.pi * self.size[0] ** 3
         radius, half = self.size
         ball = 4 / 3 * np.pi * radius**3 if self.shape == "capsule" else 0.0
         return 2 * np.pi * radius**2 * half + ball
@@ -69,7 +65,7 @@ class Part:
         elif self.shape in ("cylinder", "capsule"):
             across, along = 1 / self.size[0], 0.0
         else:
-            x, y, z = np.resize(self.size, 3)
+            x, y, z = np.array(self.size)
             across, along = x / z**2, x / y**2
         return 1 / np.sqrt((dome + across) * (dome + along))
 
