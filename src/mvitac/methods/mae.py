@@ -76,18 +76,15 @@ class MAE(Contrastive):
 
     def queries(self, batch: Views) -> Embeddings:
         """("loss", modality) -> [B], the loss of each row."""
-        seen, hidden = {}, {}
+        result: Embeddings = {}
         for stream, (modality, trunk) in enumerate(self.trunks.items()):
             images = batch.images[modality][0]
             noise = vit.row_uniform(batch.seed, batch.rows, math.prod(vit.grid_of(trunk, images)), stream)
-            visible, hidden[modality] = split_patches(noise, self.config.mask_ratio)
-            seen[modality] = vit.encode_visible(trunk, images, visible)
-        result: Embeddings = {}
-        for modality, trunk in self.trunks.items():
-            images = batch.images[modality][0]
-            predicted = self.decoders[modality](seen[modality], hidden[modality][:, None])[:, 0]
+            visible, hidden = split_patches(noise, self.config.mask_ratio)
+            seen = vit.encode_visible(trunk, images, visible)
+            predicted = self.decoders[modality](seen, hidden[:, None])[:, 0]
             with torch.autocast(images.device.type, enabled=False):
-                values = vit.take(vit.patches(trunk, images.float()), hidden[modality])
+                values = vit.take(vit.patches(trunk, images.float()), hidden)
                 if self.config.pixel_norm:
                     variance, mean = torch.var_mean(values, dim=2, keepdim=True, correction=1)
                     values = (values - mean) / (variance + EPS).sqrt()
