@@ -269,11 +269,8 @@ def _impossible(record: dict[str, Any], num_groups: int) -> str:
     if "targets" in record and len(record["targets"]) != len(n):
         return f"it has sums of {len(n)} targets, and names of {len(record['targets'])}"
     whole = n if "targets" in record else np.stack([n, np.atleast_2d(sums["correct"])])
-    if (
-        not all(np.isfinite(each).all() for each in sums.values())
-        or (whole != whole.round()).any()
-        or (whole < 0).any()
-    ):
+    finite = all(np.isfinite(each).all() for each in sums.values())
+    if not finite or (whole != whole.round()).any() or (whole < 0).any():
         return "a sum is not finite, or a number of rows is no natural number"
     if (n.sum(1) == 0).any():
         return "it has no rows"
@@ -282,10 +279,9 @@ def _impossible(record: dict[str, Any], num_groups: int) -> str:
             return "one answer is right for all rows"
         return "it has more correct rows than rows" if (sums["correct"] > n).any() else ""
     least = 1 - 1e-6  # sums have ten digits
-    low, high = sums["error"] ** 2 / np.maximum(n, 1), sums["error"] ** 2
-    if (sums["error"] < 0).any() or (
-        (sums["squared_error"] < least * low) | (least * sums["squared_error"] > high)
-    ).any():
+    error, squared = sums["error"], sums["squared_error"]
+    low, high = error**2 / np.maximum(n, 1), error**2
+    if ((error < 0) | (squared < least * low) | (least * squared > high)).any():
         return "its squared errors are smaller or larger than its errors allow"
     square, of = sums["squared_value"] * n, sums["value"] ** 2
     wrong = (square < least * of).any() or (least * square > of)[n == 1].any()

@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor, nn
 
-from mvitac.bench.external.adapters import NOTHING, RANDOM, UNKNOWN, Adapter, Loaded, parse
+from mvitac.bench.external.adapters import ABOUT, NOTHING, RANDOM, UNKNOWN, Adapter, Loaded, parse
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec, Window
 from mvitac.data.windows import windowed
@@ -211,11 +211,8 @@ class ExternalModel(Model):
 def _described(part: ExternalEncoder) -> dict[str, Any]:
     loaded = part.loaded
     return {
-        "title": loaded.title,
-        "licence": loaded.licence,
+        **{name: getattr(loaded, name) for name in ABOUT},
         "noncommercial": is_noncommercial(loaded.licence),
-        "source": loaded.source,
-        "trained_on": loaded.trained_on,
         "files": {file.name: digest_file(file) for file in loaded.files},
         "parameters": sum(p.numel() for p in loaded.network.parameters()),
         "features": part.num_features,
