@@ -116,16 +116,12 @@ def _touched(pack: Pack, rows: Sequence[np.ndarray]) -> np.ndarray:
     if "contact" in pack.table.column_names:
         said = np.char.lower(pack.column("contact").astype(str))[np.concatenate(rows)]
         yes, no = np.isin(said, ("true", "yes", "1", "1.0")), np.isin(said, ("false", "no", "0", "0.0"))
-        if not (yes | no).all():
-            raise ValueError(
-                f"{pack.path}: column contact has {str(said[~(yes | no)][0])!r}: give yes or no in every row"
-            )
+        if len(other := said[~(yes | no)]):
+            raise ValueError(f"{pack.path}: column contact has {str(other[0])!r}: give yes or no in every row")
         return yes
-    found = []
-    for each in rows:
-        images = pack.images["touch"][each].astype(np.float32)
-        found.append(np.abs(images - images[0]).mean((1, 2, 3)) > 3.0)  # levels; noise of a sensor is 1 to 2
-    return np.concatenate(found)
+    touches = (pack.images["touch"][each].astype(np.float32) for each in rows)
+    change = [np.abs(images - images[0]).mean((1, 2, 3)) for images in touches]
+    return np.concatenate(change) > 3.0  # levels; noise of a sensor is 1 to 2
 
 
 def suite_episodes(suite: Any, cell: tuple[str, ...]) -> Episodes:

@@ -48,10 +48,9 @@ def _record(targets: list[dict[str, Any]], num_test: int, sums: dict[str, Any], 
 
 def pool_values(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Pool the records of cross-validation folds, whose test groups differ, into the scores of all groups together."""
-    num, sums = len(parts[0]["targets"]), {}
-    for name in SUMS:
-        sums[name] = [[x for part in parts for x in part["group_sums"][name][t]] for t in range(num)]
-    points = [[pair for part in parts for pair in part["points"][t]] for t in range(len(parts[0]["targets"]))]
+    num = len(parts[0]["targets"])
+    sums = {name: [[x for part in parts for x in part["group_sums"][name][t]] for t in range(num)] for name in SUMS}
+    points = [[pair for part in parts for pair in part["points"][t]] for t in range(num)]
     targets = []
     for t, target in enumerate(parts[0]["targets"]):
         total = {name: float(np.sum(sums[name][t])) for name in SUMS}

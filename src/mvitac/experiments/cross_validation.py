@@ -62,17 +62,15 @@ def gather_folds(plan: Plan, works: Sequence[Work], out: Path, session: ProbeCon
     if len(results) == 1:
         return {**results[0], "plan": to_json(plan)}
     retrieval = [r for result in results for r in result["retrieval"] if r["num_groups"] >= MIN_GALLERY]
-    lists = ("notes", "run_commits", "run_devices")
-    merged = {key: [value for result in results for value in result[key]] for key in lists}
+    lists = ("notes", "run_commits", "run_devices", "unfinished")
+    named = ("failed", "run_precisions")  # by the name of a run, of which the fold is part
     return {
         **results[0],
         "plan": to_json(plan),
         "pack": digest([result["pack"] for result in results]),
         "records": pool([result["records"] for result in results]),
         "retrieval": pool_retrieval(retrieval),
-        "failed": {name: error for result in results for name, error in result["failed"].items()},
-        **{key: list(dict.fromkeys(values)) for key, values in merged.items()},
-        "run_precisions": {name: p for result in results for name, p in result["run_precisions"].items()},
-        "unfinished": [name for result in results for name in result["unfinished"]],
+        **{key: list(dict.fromkeys(value for result in results for value in result[key])) for key in lists},
+        **{key: dict(pair for result in results for pair in result[key].items()) for key in named},
         "leaks": "; ".join(dict.fromkeys(result["leaks"] for result in results if result["leaks"])),
     }

@@ -172,13 +172,12 @@ def predicted(title: str, points: Sequence[Sequence[float]], unit: str, hue: str
     low, high = float(true.min()), float(true.max())
     margin = 0.3 * max(high - low, 1e-9)
     limits = low - margin, high + margin
-    axes.plot(limits, limits, color=COLOURS["soft"], linewidth=1.1, linestyle=DASHES[1], zorder=0.9)
+    (exact,) = axes.plot(limits, limits, color=COLOURS["soft"], linewidth=1.1, linestyle=DASHES[1], zorder=0.9)
     axes.scatter(true, np.clip(guess, *limits), s=11, alpha=0.6, linewidths=0, color=COLOURS[hue])
     axes.set(xlim=limits, ylim=limits, aspect="equal", xlabel=f"true, {unit}", ylabel=f"predicted, {unit}")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(5))
     axes.grid()
-    exact = Line2D([], [], color=COLOURS["soft"], linestyle=DASHES[1], linewidth=1.1)
     figure.legend([exact], ["exact"], loc=BELOW)
     return figure
 
