@@ -8,7 +8,7 @@ import copy
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -134,10 +134,9 @@ class Entry:
         rows = np.unique(np.concatenate([split_rows(view, task).test for view in opened.packs]))
         pack, found = opened.packs[0], []
         for place, model in zip(self.places, self.models, strict=True):
-            own = isinstance(model, ExternalModel)
-            sources = None if own else read_sources(Path(place))
-            known = None if sources is None else Scored(pack).leak(sources, rows, names)
-            found.append(declared_leak(self.trained_on, names) if known is None else known)
+            sources = None if isinstance(model, ExternalModel) else read_sources(Path(place))
+            declared = declared_leak(self.trained_on, names)
+            found.append(declared if sources is None else Scored(pack).leak(sources, rows, names))
         return found
 
 
@@ -161,10 +160,9 @@ def score_suite(entry: Entry, suite: Suite, root: Path | None, parts: Path, key:
             readers = [Reader(model, opened, name) for name, model in beside]
             for ask, task in opened.tasks:
                 about = [suite.digest(), one.name, ask.name, opened.digests, here["versions"], here["commit"]]
-                about_all = (opened, suite, ask, task)
-                known = [*about, weights]
-                controls = kept_part(parts, "controls", known, lambda r=readers, a=about_all: _controls(r, *a))
-                scored = kept_part(parts, key, about, lambda r=own, a=about_all: _scores(r, *a))
+                asked = suite, ask, task
+                controls = kept_part(parts, "controls", [*about, weights], partial(_controls, readers, opened, *asked))
+                scored = kept_part(parts, key, about, partial(_scores, own, *asked))
                 block = _block(entry, one, opened, ask, task, scored, controls)
                 yield {**block, "notes": [*own[0].notes, *lacking]} if scored else block
                 advance()
@@ -180,7 +178,7 @@ def trunks(suite: Any) -> tuple[list[tuple[str, ExternalModel]], list[str]]:
         return found, [NO_IMAGENET]
 
 
-def _scores(readers: Sequence[Reader], opened: Opened, suite: Suite, ask: SuiteTask, task: AnyTask) -> Records:
+def _scores(readers: Sequence[Reader], suite: Suite, ask: SuiteTask, task: AnyTask) -> Records:
     return [stored(record) for reader in readers for record in reader.score(suite, ask, task, "", suite.probes)]
 
 

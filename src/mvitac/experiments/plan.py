@@ -12,7 +12,7 @@ from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.probe_config import Probe
 from mvitac.methods.base import MethodConfig
 from mvitac.recipes import recipe, with_method
-from mvitac.registry import check_known, default, from_json, to_json, unknown
+from mvitac.registry import check_known, check_range, default, from_json, to_json, unknown
 from mvitac.run import Run
 from mvitac.system.files import brief, parse_json
 
@@ -73,8 +73,7 @@ class Plan:
 
     def __post_init__(self) -> None:
         labels = [row.label for row in self.rows]
-        if not 1 <= self.seeds <= 1000:
-            raise ValueError(f"seeds {self.seeds}: give 1 to 1000")
+        check_range(self, 1, 1000, "seeds")
         if any("seed" in given for given in (self.set, *(row.set for row in self.rows))):
             raise ValueError("seed: runs have the seeds 0 .. seeds - 1, give their number")
         if not all(slug(label) for label in labels):

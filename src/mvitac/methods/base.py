@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
+from mvitac.nn import vit
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, keep_modes
 from mvitac.registry import Registered, check_range
 
@@ -181,7 +182,8 @@ class MethodConfig(Registered, ABC):
 
     def check_encoder(self, encoder: EncoderConfig, size: int) -> None:
         """Raise ValueError if the method cannot train ``encoder`` of a modality on views of ``size`` px."""
-        return
+        if self.needs_vit:
+            vit.check_vit(encoder, self.name, size)
 
     def check_modalities(self, spec: DataSpec) -> None:
         """Raise ValueError if the method ``needs_pairs`` and the dataset lacks a modality."""

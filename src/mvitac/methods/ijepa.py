@@ -32,7 +32,7 @@ from torch import Tensor, nn
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
 from mvitac.nn import vit
-from mvitac.nn.encoders import EncoderConfig, Encoders
+from mvitac.nn.encoders import Encoders
 from mvitac.nn.momentum import Momentum
 from mvitac.registry import check_range
 
@@ -61,9 +61,6 @@ class IJEPAConfig(MethodConfig):
         check_range(self, 1, 64, "num_targets")
         if not 0 < self.target_scale[0] <= self.target_scale[1] <= 1:
             raise ValueError(f"target_scale {self.target_scale}: give two rising numbers above 0, at most 1")
-
-    def check_encoder(self, encoder: EncoderConfig, size: int) -> None:
-        vit.check_vit(encoder, self.name, size)
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "IJEPA":
         return IJEPA(self, spec, encoder)

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
 from mvitac.nn import vit
-from mvitac.nn.encoders import EncoderConfig, Encoders
+from mvitac.nn.encoders import Encoders
 from mvitac.registry import check_range
 
 EPS = 1e-6  # added to the variance of a patch, as in the authors' code
@@ -46,9 +46,6 @@ class MAEConfig(MethodConfig):
 
     def __post_init__(self) -> None:
         check_range(self, 0.01, 0.99, "mask_ratio")
-
-    def check_encoder(self, encoder: EncoderConfig, size: int) -> None:
-        vit.check_vit(encoder, self.name, size)
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "MAE":
         return MAE(self, spec, encoder)

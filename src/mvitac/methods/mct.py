@@ -72,15 +72,12 @@ class MCT(MViTac):
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         assert self.queues, "call prepare(rows) first"
-        losses = {}
+        losses, tau, margin = {}, self.mct.temperature, self.mct.margin
         self.pending = {(m, head): z["k", m, 1, head] for m, head in HEADS}
         for part, (x, y) in PARTS.items():
             head = "intra" if x == y else "inter"
             query, key, queue = z["q", x, 0, head], z["k", y, 1, head], self.queue(y, head).keys
-            if x == y:
-                losses[part] = queue_nce(query, key, queue, self.mct.temperature)
-            else:
-                losses[part] = hinge(query, key, queue, self.mct.margin)
+            losses[part] = queue_nce(query, key, queue, tau) if x == y else hinge(query, key, queue, margin)
         loss = losses["vv"] + losses["tt"] + self.mct.lambda_inter * (losses["vt"] + losses["tv"])
         return {"loss": loss, **losses}
 

@@ -129,16 +129,11 @@ def retrieval_rows(records: Sequence[dict[str, Any]]) -> list[list[str]]:
     rows = []
     for found in grouped(records, ("source", "direction")):
         mark = leak_mark(leaks_in(found))
-        *scores, chance = (percent(recall(found, key)) for key in RETRIEVAL)
+        mean = {key: sum(record[key] for record in found) / len(found) for key in RETRIEVAL}
+        mean["R@5"] = interval(found)[0]  # from its counts, so that it equals the mean of its interval
+        *scores, chance = map(percent, mean.values())
         rows.append([found[0]["source"], found[0]["direction"], *(score + mark for score in scores), chance])
     return rows
-
-
-def recall(records: Sequence[dict[str, Any]], key: str) -> float:
-    """Mean over seeds of one of ``RETRIEVAL``; R@5 from its counts, so that it equals the mean of its interval."""
-    if key == "R@5":
-        return interval(records)[0]
-    return sum(r[key] for r in records) / len(records)
 
 
 def print_finetuning(result: dict[str, Any], file: TextIO | None = None) -> None:
