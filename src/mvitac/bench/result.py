@@ -61,8 +61,7 @@ def records_of(block: dict[str, Any], encoder: dict[str, Any]) -> list[dict[str,
     for one in block["records"]:
         record = {"task": block["task"], **one, **_scores(one)}
         if not one["source"]:
-            leak = block["leaks"][encoder["seeds"].index(one["seed"])]
-            record |= {"source": encoder["name"], "leak": leak}
+            record |= {"source": encoder["name"], "leak": block["leaks"][encoder["seeds"].index(one["seed"])]}
         found.append(record)
     return found
 

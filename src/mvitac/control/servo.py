@@ -174,8 +174,7 @@ def task_of(kind: str) -> Any:
 
 
 def textured(shape: Shape, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    places = [(y + 25) / MAP_MM, (x + 25) / MAP_MM]
-    return map_coordinates(shape.texture, places, order=1, mode="mirror")
+    return map_coordinates(shape.texture, [(y + 25) / MAP_MM, (x + 25) / MAP_MM], order=1, mode="mirror")
 
 
 class Copy:

@@ -210,8 +210,7 @@ class Pack:
 
         In this split only that task may see them (Touch and Go's official split: frames that only the rough lists name).
         """
-        tasks = self.spec.all_tasks
-        shared, others = ([t for t in tasks if (t.split == "split") == same] for same in (True, False))
+        shared, others = ([t for t in self.spec.all_tasks if (t.split == "split") == same] for same in (True, False))
         if not shared or not others:
             return np.zeros(self.num, bool)
         seen, alone = (np.any([self.answered(task) for task in some], axis=0) for some in (shared, others))

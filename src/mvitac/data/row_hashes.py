@@ -21,8 +21,7 @@ def row_hashes(pack: Pack) -> tuple[np.ndarray, np.ndarray]:
         return np.concatenate(ids), np.concatenate(groups)
     name = pack.spec.name.split(" (")[0]
     ids, groups = pack.own_ids, pack.column("group").astype(str)
-    weak = pack.spec.group_by == "row"
-    return _hash(ids, name, False), _hash(groups, name, weak)
+    return _hash(ids, name, False), _hash(groups, name, pack.spec.group_by == "row")
 
 
 def image_sums(pack: Pack) -> np.ndarray:

@@ -187,8 +187,7 @@ def _in_folds(
 
 def as_trained(model: Model, pack: Pack) -> Pack:
     """``pack`` with the windows that ``model`` was trained on, if it shows single frames and is not joined."""
-    known = pack.spec.window.active or isinstance(pack, JoinedPack)
-    return pack if known else windowed(pack, model.spec.window)
+    return pack if pack.spec.window.active or isinstance(pack, JoinedPack) else windowed(pack, model.spec.window)
 
 
 def _common_pack(models: Sequence[Model], pack: Pack | None) -> Pack:

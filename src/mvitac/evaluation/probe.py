@@ -203,8 +203,7 @@ def own_heads(
         z = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in model.encoders}
         # Match columns by name: this pack may order the classes differently or have fewer.
         columns = [known[task.name].index(name) for name in _outputs(task)]
-        predicted = model.answer(task.name, z).numpy()[:, columns]
-        result = score_rows(pack, task, rows, predicted)
+        result = score_rows(pack, task, rows, model.answer(task.name, z).numpy()[:, columns])
         records.append({"task": task.name, "modality": whole, "probe": "own", **result})
     return records
 

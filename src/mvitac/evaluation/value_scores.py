@@ -36,8 +36,7 @@ def score_values(y: np.ndarray, predicted: np.ndarray, groups: np.ndarray, targe
         r2 = float(r_squared({name: np.array(sums[name][-1]).sum() for name in SUMS}))
         errors = {"r2": r2, "mae": float(abs(error).mean()), "rmse": float((error**2).mean() ** 0.5)}
         scored.append({"name": target.name, "unit": target.unit, **errors, "ranges": error_by_range(true, error)})
-        shown = drawn[have[drawn]]
-        points.append([[float(f"{v:.5g}") for v in (y[i, t], predicted[i, t])] for i in shown])
+        points.append([[float(f"{v:.5g}") for v in (y[i, t], predicted[i, t])] for i in drawn[have[drawn]]])
     return _record(scored, int((~np.isnan(y)).any(1).sum()), sums, points)
 
 

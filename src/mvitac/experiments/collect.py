@@ -163,8 +163,7 @@ def cost(label: str, jobs: Sequence[Job], pack: Pack) -> dict[str, Any]:
 def pairs_of(run: Run, views: int, pack: Pack) -> str:
     """Which rows form a positive pair (``Run.positives``). This matters more than the choice of most methods."""
     other = run.positives != "same-image" if views > 1 else run.positives == "same-touch-pairs"
-    several = len(np.unique(pack.touch_groups)) < pack.num
-    return "two rows of a touch" if other and several else ONE_ROW
+    return "two rows of a touch" if other and len(np.unique(pack.touch_groups)) < pack.num else ONE_ROW
 
 
 def outline(work: Work) -> list[str]:

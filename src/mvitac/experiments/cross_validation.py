@@ -52,8 +52,7 @@ def lay_out_folds(plan: Plan, out: Path, session: ProbeConfig, device: str = "au
 
 def together(works: Sequence[Work]) -> Work:
     """The jobs of all folds as one work, ordered by seed."""
-    jobs = sorted((job for work in works for job in work.jobs), key=lambda job: job.run.seed)
-    return replace(works[0], jobs=jobs)
+    return replace(works[0], jobs=sorted((job for work in works for job in work.jobs), key=lambda job: job.run.seed))
 
 
 def gather_folds(plan: Plan, works: Sequence[Work], out: Path, session: ProbeConfig) -> dict[str, Any]:

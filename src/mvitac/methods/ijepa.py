@@ -134,8 +134,7 @@ class IJEPA(Contrastive):
         self.teachers = nn.ModuleDict({m: Momentum(vit.vit_of(trunk)) for m, trunk in self.trunks.items()})
         self.predictors = nn.ModuleDict()
         for modality, trunk in self.trunks.items():
-            width = vit.vit_of(trunk).embed_dim
-            self.predictors[modality] = vit.Predictor(trunk, width, 1 / 2, (384, 12))
+            self.predictors[modality] = vit.Predictor(trunk, vit.vit_of(trunk).embed_dim, 1 / 2, (384, 12))
 
     def blocks(self, batch: Views, modality: str) -> Blocks:
         """The blocks of each image that the ViT of ``modality`` sees."""

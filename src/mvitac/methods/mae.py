@@ -85,8 +85,7 @@ class MAE(Contrastive):
                 if self.config.pixel_norm:
                     variance, mean = torch.var_mean(values, dim=2, keepdim=True, correction=1)
                     values = (values - mean) / (variance + EPS).sqrt()
-                error = (predicted.float() - values) ** 2
-                result["loss", modality] = error.flatten(1).mean(1)
+                result["loss", modality] = ((predicted.float() - values) ** 2).flatten(1).mean(1)
         return result
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:

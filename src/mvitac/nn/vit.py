@@ -163,8 +163,7 @@ class Predictor(nn.Module):
         ``live`` says which of ``hidden`` count, if the visible tokens say which of them do. No token attends to the
         others.
         """
-        width = self.mask_token.shape[3]
-        positions = sin_cos_positions(*seen.grid, width, hidden.device)
+        positions = sin_cos_positions(*seen.grid, self.mask_token.shape[3], hidden.device)
         front = seen.values.shape[1] - seen.at.shape[1]
         known = self.embed(seen.values) + F.pad(positions[seen.at], (0, 0, front, 0))
         num_sets, length = hidden.shape[1:]

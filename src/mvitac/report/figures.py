@@ -53,8 +53,7 @@ def bars(
     ``groups``: modality -> source -> mean, low and high, at most 1; ``low`` None: no whisker. ``lines``
     are vertical ones across all groups, such as majority or chance. ``what`` labels the axis.
     """
-    num_rows = sum(len(group) + 1.25 for group in groups.values())
-    figure, axes = new_figure(title, 0.85 + 0.21 * num_rows)
+    figure, axes = new_figure(title, 0.85 + 0.21 * sum(len(group) + 1.25 for group in groups.values()))
     y, ticks, spans, top = 0.0, {}, [], max([0.0, *lines.values()])
     lows = [cell[k] for group in groups.values() for cell in group.values() for k in ("mean", "low")]
     least = max(LEAST, min(0.0, *(low for low in lows if low is not None)))

@@ -122,8 +122,7 @@ def _head(study: Study, title: str) -> Markup:
     if summary:
         task, first = next(iter(summary.items()))
         text = f"On {task}, {'. '.join(said)}." if (said := verdicts(first)) else ""
-    tiles = [_tile(study, task) for task in summary]
-    return page.head(title, "Pre-training report", chips, text, tiles)
+    return page.head(title, "Pre-training report", chips, text, [_tile(study, task) for task in summary])
 
 
 def _tile(study: Study, task: str) -> Markup:

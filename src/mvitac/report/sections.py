@@ -177,8 +177,7 @@ def confusions(study: Study) -> list[Markup]:
         if source not in {s for cells in study.result["summary"].get(task, {}).values() for s in cells}:
             continue
         modality = headline(study.result["summary"][task], source, study.sources)[0]
-        kind = study.result["records"][0]["probe"]
-        wanted = {"task": task, "modality": modality, "source": source, "probe": kind}
+        wanted = {"task": task, "modality": modality, "source": source, "probe": study.result["records"][0]["probe"]}
         found = [r for r in study.result["records"] if all(r[k] == v for k, v in wanted.items())]
         counts = np.sum([r["confusion"] for r in found], axis=0)
         drawing = figures.confusion(f"{task}, {WORDS[modality]}", counts, classes)
@@ -187,5 +186,4 @@ def confusions(study: Study) -> list[Markup]:
         drawn.append(study.figure(f"confusion {task}", drawing, alt, caption))
     if not drawn:
         return []
-    intro = f"Each row is a true class and sums to 100 % ({source})."
-    return [html.paragraph(intro), html.grid(drawn)]
+    return [html.paragraph(f"Each row is a true class and sums to 100 % ({source})."), html.grid(drawn)]

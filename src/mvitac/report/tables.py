@@ -120,8 +120,7 @@ def print_retrieval(result: dict[str, Any], file: TextIO | None = None) -> None:
         return
     unseen = unseen_groups(result["group_by"], result["retrieval"])
     columns = ("", "query -> found", *(f"{column} %" for column in RETRIEVAL))
-    rows = retrieval_rows(result["retrieval"])
-    print(text_table(f"retrieval over {unseen}", columns, rows, words=2), file=file)
+    print(text_table(f"retrieval over {unseen}", columns, retrieval_rows(result["retrieval"]), words=2), file=file)
 
 
 def retrieval_rows(records: Sequence[dict[str, Any]]) -> list[list[str]]:

@@ -43,8 +43,7 @@ def press_ball(seed: int, number: int, *, size: int, sensors: Sequence[Sensor], 
     place = rng.uniform(-0.46, 0.46, 2) * FIELD_MM
     gain, unit = float(np.exp(rng.uniform(*np.log((0.5, 1.2))))), int(rng.integers(2**31))
     pressed = imprint(2 * size, float(place[0]), float(place[1]), radius)
-    pixel = FIELD_MM / (2 * size)
-    draw = partial(render, sensor=sensor, rng=rng, pixel_mm=pixel, size=size, unit=unit, gain=gain)
+    draw = partial(render, sensor=sensor, rng=rng, pixel_mm=FIELD_MM / (2 * size), size=size, unit=unit, gain=gain)
     warm = draw(pressed) * rng.normal(1.0, DRIFT, 3)
     made: dict[str, Any] = {"touch": np.clip(warm + 0.5, 0, 255).astype(np.uint8)}
     if background:

@@ -89,9 +89,7 @@ def photograph(bench: Bench, view: View, rng: np.random.Generator, *, size: int)
     to_lamp = view.lamp - points
     to_lamp /= np.linalg.norm(to_lamp, axis=1, keepdims=True)
     facing = np.sum(normal * to_lamp, axis=1)
-    lit = hit & (facing > 0)
-    shadowed = _shadow(bench, view.lamp, points, lit)
-    direct = np.clip(facing, 0, None) * ~shadowed
+    direct = np.clip(facing, 0, None) * ~_shadow(bench, view.lamp, points, hit & (facing > 0))
     half = to_lamp - rays
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     shine = np.clip(np.sum(normal * half, axis=1), 0, 1) ** 40 * gloss * (direct > 0)
@@ -126,8 +124,7 @@ def cast(
     """
     count, flat = len(rays), np.ascontiguousarray(rays).ravel()
     geom, distance, normal = np.full(count, -1, np.int32), np.zeros(count), np.zeros(3 * count)
-    scene = bench.model, bench.data
-    mujoco.mj_multiRay(*scene, origin, flat, groups, True, -1, geom, distance, normal, count, 10.0)
+    mujoco.mj_multiRay(bench.model, bench.data, origin, flat, groups, True, -1, geom, distance, normal, count, 10.0)
     return geom, np.where(geom >= 0, distance, 0.0), normal.reshape(-1, 3)
 
 

@@ -139,8 +139,7 @@ def _illuminate(imprint: F, sensor: Sensor, copy: Rng, paint: Rng, pixel_mm: flo
     u, v = _axes_unit(imprint.shape)
     # paint is uneven: a faint grain of slope; each copy has its own LED balance and a slightly shifted glow
     grain = gaussian_filter(paint.standard_normal(imprint.shape, np.float32), 1.0) * np.float32(0.0035)
-    surface = imprint + grain
-    gy, gx = np.gradient(surface, np.float32(pixel_mm))
+    gy, gx = np.gradient(imprint + grain, np.float32(pixel_mm))
     balance = copy.normal(1.0, 0.05, 3) * copy.normal(1.0, 0.04)
     shift = copy.normal(0.0, 0.05, (3, 2))
     picture = np.empty((*imprint.shape, 3), np.float32)

@@ -147,8 +147,7 @@ def _relief(bench: physics.Bench, patch: skin.Patch, side: int, grid: int) -> np
     rays[..., 0], rays[..., 1], rays[..., 2] = sign * BEHIND_M, -sign * axis[None, :], -axis[:, None]
     rays = rays.reshape(-1, 3) / BEHIND_M
     origin = apex - [sign * BEHIND_M, 0, 0]
-    groups = np.array([0, 0, 1, 0, 0, 0], np.uint8)
-    geom, distance, _ = camera.cast(bench, origin, rays, groups)
+    geom, distance, _ = camera.cast(bench, origin, rays, np.array([0, 0, 1, 0, 0, 0], np.uint8))
     points = origin + rays * distance[:, None]
     local = (points - bench.data.xpos[bench.body]) @ bench.data.xmat[bench.body].reshape(3, 3)
     hit = geom >= 0

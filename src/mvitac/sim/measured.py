@@ -78,8 +78,7 @@ def read(calibration: str) -> Gel:
     table = gaussian_filter1d(table, 2.0, axis=1, mode="wrap")
     table = table - table[:1]  # no slope, no change: the gel at rest is the frame itself
     spread = _SPREAD * places.std(0)
-    flat = table.reshape(-1, 3, 6).astype(np.float32)
-    return Gel(rest, flat, places.mean(0) - spread, places.mean(0) + spread)
+    return Gel(rest, table.reshape(-1, 3, 6).astype(np.float32), places.mean(0) - spread, places.mean(0) + spread)
 
 
 @cache

@@ -47,8 +47,7 @@ class Log:
     def __enter__(self) -> "Log":
         if not self.quiet:
             self.stack.enter_context(shown())
-            bar = work("training", self.num_steps, "steps", done=self.start)
-            self.advance_bar = self.stack.enter_context(bar)
+            self.advance_bar = self.stack.enter_context(work("training", self.num_steps, "steps", done=self.start))
         return self
 
     def __exit__(self, *_: object) -> None:

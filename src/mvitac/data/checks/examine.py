@@ -101,8 +101,7 @@ def examine_source(
     some = _Some(source, num)
     with tempfile.TemporaryDirectory(prefix="mvitac-check-") as folder:
         pack = build(some, Path(folder) / "pack", size=size, workers=workers, max_damaged=1.0, quiet=quiet)
-        partly = len(some.items()) < len(source.items())
-        findings = examine(pack, part=partly)
+        findings = examine(pack, part=len(some.items()) < len(source.items()))
         read = f"{len(some.items())} of {len(source.items())} items examined, kept at {size} px"
         findings.insert(0, Finding("source", "ok", f"{pack.spec.name}: {read}"))
         if draw:
