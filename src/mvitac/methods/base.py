@@ -23,6 +23,8 @@ RANGES = {
     **dict.fromkeys(("momentum", "bank_momentum", "centre_momentum", "ema"), (0, 1)),
     **dict.fromkeys(("margin", "lambda_inter", "lambda_sensor", "invariance", "variance", "covariance"), (0, 1e6)),
     **dict.fromkeys(("out", "hidden"), (1, 65536)),
+    **{"queue": (1, 1 << 24), "num_negatives": (1, 1 << 20), "num_targets": (1, 64)},
+    **{"mask_ratio": (0.01, 0.99), "dropout": (0, 0.99)},
 }
 """Fields of methods' configs -> what they may be. A method checks its other numbers in its own ``__post_init__``."""
 Embeddings = dict[Hashable, Tensor]

@@ -29,7 +29,6 @@ from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
 from mvitac.nn.encoders import Encoders, build_towers
 from mvitac.nn.memory_bank import Bank
-from mvitac.registry import check_range
 
 EPS = 1e-7  # added to both denominators, as in the reference code
 NEGATIVES_PER_ROW = 0.18  # at most: TAG's 16,384 of 91,982 rows
@@ -52,10 +51,6 @@ class CMCConfig(MethodConfig):
     """Use InfoNCE over the positive and the K negatives instead of NCE (an option of the reference code)."""
     out: Fixed[int] = 128
     """Width of the embeddings (TAG: 128)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_range(self, 1, 1 << 20, "num_negatives")
 
     def negatives(self, num_rows: int) -> int:
         """Number of negatives when training on ``num_rows`` rows."""

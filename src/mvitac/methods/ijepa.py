@@ -34,7 +34,6 @@ from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, wi
 from mvitac.nn import vit
 from mvitac.nn.encoders import Encoders
 from mvitac.nn.momentum import Momentum
-from mvitac.registry import check_range
 
 TRIES = 8
 ASPECT, CONTEXT, MIN_CONTEXT = (0.75, 1.5), (0.85, 1.0), 10
@@ -58,7 +57,6 @@ class IJEPAConfig(MethodConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range(self, 1, 64, "num_targets")
         if not 0 < self.target_scale[0] <= self.target_scale[1] <= 1:
             raise ValueError(f"target_scale {self.target_scale}: give two rising numbers above 0, at most 1")
 

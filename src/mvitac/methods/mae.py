@@ -27,7 +27,6 @@ from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
 from mvitac.nn import vit
 from mvitac.nn.encoders import Encoders
-from mvitac.registry import check_range
 
 EPS = 1e-6  # added to the variance of a patch, as in the authors' code
 
@@ -43,9 +42,6 @@ class MAEConfig(MethodConfig):
     """Share of the patches that is hidden (MAE, Sparsh: .75; T3: .4)."""
     pixel_norm: bool = True
     """Predict each patch minus its mean and over its standard deviation (MAE, T3). Sparsh and AnyTouch: off."""
-
-    def __post_init__(self) -> None:
-        check_range(self, 0.01, 0.99, "mask_ratio")
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "MAE":
         return MAE(self, spec, encoder)

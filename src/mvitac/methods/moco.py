@@ -19,7 +19,6 @@ from mvitac.nn.encoders import Encoders, Head, build_towers
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Queue
 from mvitac.nn.momentum import Momentum
-from mvitac.registry import check_range
 
 KEYS_PER_ROW = 0.125
 """Most keys per training row. In a longer queue, a row often meets its own older key and those of its positives."""
@@ -40,10 +39,6 @@ class QueueConfig(MethodConfig, ABC):
     """Hidden width of the 2-layer heads (MoCo v2: the trunk's width)."""
     head_norm: Fixed[bool] = False
     """BatchNorm after the first layer of the heads (MoCo v2: none)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_range(self, 1, 1 << 24, "queue")
 
     def queue_size(self, num_rows: int) -> int:
         """Number of keys to keep when training on ``num_rows`` rows."""

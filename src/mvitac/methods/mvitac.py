@@ -39,7 +39,6 @@ from mvitac.nn.encoders import (
 )
 from mvitac.nn.losses import info_nce
 from mvitac.nn.momentum import Momentum
-from mvitac.registry import check_range
 from mvitac.system.threads import in_branches
 
 HEADS = ("intra", "inter")
@@ -83,7 +82,6 @@ class MViTacConfig(MethodConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range(self, 0, 0.99, "dropout")
         if not self.losses or len(set(self.losses)) < len(self.losses):
             raise ValueError(f"losses {self.losses}: give one or more of vv, tt, vt, tv, each once")
         if self.pairs == "all" and not self.both_ways:

@@ -94,8 +94,7 @@ _NOT_LOSS = ("step", "lr", "pairs_per_s", "loss", "eval")
 
 def loss(study: Study) -> list[Markup]:
     """The total loss of every run, and the parts of each method's loss."""
-    series = [(r, [entry for entry in r.log if "loss" in entry]) for r in study.runs]
-    series = [(r, entries) for r, entries in series if entries]
+    series = [(r, entries) for r in study.runs if (entries := [entry for entry in r.log if "loss" in entry])]
     if not series:
         return [html.paragraph("The runs left no log lines.")]
     total = [Line(r.source, *_column(entries, "loss"), study.hue(r)) for r, entries in series]
