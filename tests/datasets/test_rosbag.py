@@ -109,7 +109,7 @@ def test_clocks_that_pair_nothing(tmp_path: Path, gel: list[float], front: list[
     else:
         assert f"1 messages of {GEL} have the stamp of another" in config.manifest().notes[0]
         (tmp_path / "bag" / "metadata.yaml").unlink()
-        with pytest.raises(ValueError, match=r"bag\.mcap has no metadata\.yaml \(a recording that was killed\)"):
+        with pytest.raises(ValueError, match=r"bag\.mcap has no metadata\.yaml"):
             RosbagConfig(path=tmp_path, touch=(GEL,)).source()
 
 

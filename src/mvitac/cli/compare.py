@@ -15,7 +15,7 @@ from mvitac.experiments.jobs import do_all
 from mvitac.experiments.plan import PLANS, Plan, find_plan, setting
 from mvitac.experiments.table_formats import write_tables
 from mvitac.recipes import RECIPES
-from mvitac.registry import to_json, unknown
+from mvitac.registry import check_known, to_json
 from mvitac.system.device import pick_device
 from mvitac.system.files import check_place, write_json
 from mvitac.system.locks import hold_lock
@@ -100,8 +100,7 @@ def compare(argv: list[str]) -> None:
 
 
 def _parse(chosen: dict[str, str], rest: list[str], plan: Plan) -> _Options:
-    if chosen.get("--recipe", plan.recipe) not in RECIPES:
-        raise unknown("recipe", chosen.get("--recipe", plan.recipe), RECIPES)
+    check_known("recipe", [chosen.get("--recipe", plan.recipe)], RECIPES)
     data = dataset(chosen["--data"]) if "--data" in chosen else plan.data
     data = data or dataset("grasps" if plan.name == "table2" else "materials")
     same: Any = {name: getattr(plan, name) for name in _SAME}

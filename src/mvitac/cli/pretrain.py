@@ -63,16 +63,13 @@ def _chosen_run(chosen: dict[str, str], rest: list[str], phased: bool) -> Run:
 
     ``phased`` is for data that does not know it before it is opened. ``--epochs`` in ``rest`` replaces the recipe's steps.
     """
-    run = _unchanged_run(chosen, phased)
-    return replace(run, steps=None) if any(word.split("=")[0] == "--epochs" for word in rest) else run
-
-
-def _unchanged_run(chosen: dict[str, str], phased: bool) -> Run:
     if "--from" in chosen:
         for name in ("--method", "--data", "--recipe"):
             if name in chosen:
                 raise ValueError(f"--from already decides {name}: leave it out, or change single fields")
-        return load_run(Path(chosen["--from"]))[0]
-    data = dataset(chosen.get("--data", "materials"))
-    base = recipe(chosen.get("--recipe", "quick"), data, phased if data.phased is None else data.phased)
-    return with_method(base, chosen.get("--method", base.method.name))
+        run = load_run(Path(chosen["--from"]))[0]
+    else:
+        data = dataset(chosen.get("--data", "materials"))
+        base = recipe(chosen.get("--recipe", "quick"), data, phased if data.phased is None else data.phased)
+        run = with_method(base, chosen.get("--method", base.method.name))
+    return replace(run, steps=None) if any(word.split("=")[0] == "--epochs" for word in rest) else run

@@ -150,11 +150,8 @@ def ros_pixels(message: Any, name: str) -> bytes | np.ndarray:
     if not channels:
         raise ValueError(f"{name} has the encoding {code}: {', '.join(ROS_CHANNELS)} are read")
     kind = kind.newbyteorder(">" if message.is_bigendian else "<")
-    if (
-        not message.height * message.width
-        or len(message.data) % message.height
-        or (len(message.data) < message.height * message.width * channels * kind.itemsize)
-    ):
+    least = message.height * message.width * channels * kind.itemsize
+    if not 0 < least <= len(message.data) or len(message.data) % message.height:
         size = f"{message.width} x {message.height} pixels of {code}"
         raise ValueError(f"{name} has {len(message.data)} bytes for {size}: it is damaged")
     lines = np.frombuffer(message.data, kind).reshape(message.height, -1)[:, : message.width * channels]  # padded

@@ -28,7 +28,7 @@ import numpy as np
 from mvitac.data.source import Sample, Source, one_stamp, stamp_of
 from mvitac.data.spec import PHASES, DataSpec, Task
 from mvitac.datasets.base import KEEPING, DatasetConfig
-from mvitac.registry import check_range, to_json, unknown
+from mvitac.registry import check_known, check_range, to_json
 from mvitac.system.files import brief, digest
 
 VERSION = 1  # version of this reader. Increase it when the same shards would give another pack.
@@ -110,8 +110,7 @@ class CalandraConfig(DatasetConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.split not in ("authors", "object"):
-            raise unknown("split", self.split, ("authors", "object"))
+        check_known("split", [self.split], ("authors", "object"))
         check_range(self, 0, 0.9, "val_share")
         check_range(self, 0, math.inf, "split_seed")
         for asked in self.ask:

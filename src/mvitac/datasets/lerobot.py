@@ -179,15 +179,9 @@ def _is_new(info: dict[str, Any]) -> bool:
 
 def _episodes(root: Path, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Return what meta/episodes says of each episode; nothing if version 2 lacks the file."""
-    if _is_new(info):
-        table = _read(root / "meta" / "episodes")
-        names = [
-            name for name in table.column_names if name in ("episode_index", "length") or name.startswith("videos/")
-        ]
-        found = table.select(names).to_pylist()
-    else:
-        found = _lines(root / "meta" / "episodes.jsonl", "episode_index")
-    return {str(episode["episode_index"]): episode for episode in found}
+    file = root / "meta" / ("episodes" if _is_new(info) else "episodes.jsonl")
+    with fields_of(file):
+        return {str(each["episode_index"]): each for each in _rows(file, ("episode_index", "length", "videos/"))}
 
 
 def _check(root: Path, rows: Sequence[Row], episodes: dict[str, dict[str, Any]]) -> None:
@@ -199,7 +193,7 @@ def _check(root: Path, rows: Sequence[Row], episodes: dict[str, dict[str, Any]])
         if stands.any():
             row = rows[order[np.argmax(stands) + 1]]
             where = f"{root / 'data'}: episode {row['episode_index']}, frame {row['frame_index']}"
-            raise ValueError(f"{where}: {name} {row[name]} does not rise: fetch it again, or write it again")
+            raise ValueError(f"{where}: {name} {row[name]} does not rise: fetch it again")
     for name, num in Counter(row["episode_index"] for row in rows).items():
         said = episodes.get(name, {}).get("length", num if name in episodes else "nothing")
         if episodes and said != num:
@@ -210,37 +204,27 @@ def _numbers(root: Path, rows: Sequence[Row], name: str) -> np.ndarray:
     values = np.array([number_of(row[name]) for row in rows], float)
     if not np.isfinite(values).all():
         i = int(np.argmin(np.isfinite(values)))
-        raise ValueError(
-            f"{root / 'data'}: {name} of row {i + 1} is {rows[i][name]!r}: fetch it again, or write it again"
-        )
+        raise ValueError(f"{root / 'data'}: {name} of row {i + 1} is {rows[i][name]!r}: fetch it again")
     return values
 
 
 def _tasks(root: Path, info: dict[str, Any]) -> dict[str, str]:
     """Return the text of each task_index."""
-    file = root / "meta" / "tasks.parquet"
-    if not _is_new(info):
-        pairs = [(str(t["task_index"]), t["task"]) for t in _lines(root / "meta" / "tasks.jsonl", "task_index", "task")]
-    else:
-        table = _read(file) if file.is_file() else pa.table({"task_index": [], "task": []})
-        with fields_of(file):
-            text = next(name for name in (*table.column_names, "task") if name != "task_index")
-            pairs = [*zip(map(str, table["task_index"].to_pylist()), table[text].to_pylist(), strict=True)]
+    file = root / "meta" / ("tasks.parquet" if _is_new(info) else "tasks.jsonl")
+    with fields_of(file):
+        rows = _rows(file) if file.is_file() else []
+        pairs = [(str(row.pop("task_index")), row.popitem()[1]) for row in rows]
     if len(tasks := dict(pairs)) < len({*pairs}):
-        raise ValueError(f"{root}: meta/tasks has a task_index with two texts: fetch it again")
+        raise ValueError(f"{file} has a task_index with two texts: fetch it again")
     return tasks
 
 
-def _lines(path: Path, *names: str) -> list[dict[str, Any]]:
-    """Return the objects of a .jsonl file, which must have ``names``; none if there is no file."""
-    found = [*map(parse_json, path.read_text().splitlines())] if path.is_file() else []
-    if not all(isinstance(line, dict) and {*names} <= line.keys() for line in found):
-        raise ValueError(f"{path} has lines without {' or '.join(names)}: fetch it again")
-    return found
-
-
-def _read(path: Path) -> pa.Table:
+def _rows(path: Path, begins: tuple[str, ...] = ("",)) -> list[dict[str, Any]]:
+    """Return the rows of a .jsonl file, if there is one, or of parquet, of columns whose name ``begins`` so."""
+    if path.suffix == ".jsonl":
+        return [*map(parse_json, path.read_text().splitlines())] if path.is_file() else []
     try:
-        return pq.read_table(path)
+        table = pq.read_table(path)
     except (pa.ArrowException, OSError) as error:
         raise ValueError(f"{path} cannot be read ({brief(error)}): fetch the whole dataset") from None
+    return table.select([name for name in table.column_names if name.startswith(begins)]).to_pylist()

@@ -52,9 +52,7 @@ class RosbagConfig(RecordedConfig):
             bags = sorted([*(file.parent for file in path.rglob("metadata.yaml")), *path.rglob("*.bag")])
             for file in sorted([*path.rglob("*.mcap"), *path.rglob("*.db3")]):
                 if file.parent not in bags:
-                    raise ValueError(
-                        f"{file} has no metadata.yaml (a recording that was killed): ros2 bag reindex, or move it"
-                    )
+                    raise ValueError(f"{file} has no metadata.yaml (was its recording killed?): ros2 bag reindex")
         if not bags:
             raise ValueError(f"{path} is no bag and holds none: give a folder with metadata.yaml, a .bag, or several")
         cameras = [topic for topic in (*self.touch, self.vision) if topic]
@@ -136,10 +134,7 @@ def _read(bag: Path, cameras: Sequence[str], asked: Sequence[str]) -> dict[str, 
             topic, message = connection.topic, reader.deserialize(raw, connection.msgtype)
             stamp = getattr(getattr(message, "header", None), "stamp", None)
             time = 1e-9 * received if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
-            row = {
-                name: _field(message, name.removeprefix(f"{topic}."), f"{bag}, {topic}")
-                for name in fields.get(topic, ())
-            }
+            row = {name: _field(message, name[len(topic) + 1 :], f"{bag}, {topic}") for name in fields.get(topic, ())}
             found[topic].append((time or 1e-9 * received, row or place))
     ordered = {topic: sorted(each, key=lambda one: one[0]) for topic, each in found.items()}
     return {topic: (np.array([time for time, _ in each]), [v for _, v in each]) for topic, each in ordered.items()}

@@ -15,7 +15,7 @@ from mvitac.data.images import difference
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Target, Task, ValueTask
 from mvitac.datasets.base import KEEPING, DatasetConfig
-from mvitac.registry import check_range, to_json, unknown
+from mvitac.registry import check_known, check_range, to_json
 from mvitac.sim import grasps, materials, measured
 from mvitac.sim.sensors import NAMED, SENSORS, Sensor, random_sensors
 
@@ -71,9 +71,7 @@ class PressConfig(SimulatedConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_range(self, 0, 10_000, "sensors")
-        for name in self.makes:
-            if name not in NAMED:
-                raise unknown("sensor", name, NAMED)
+        check_known("sensor", self.makes, NAMED)
         if self.held_out_sensor and (self.makes or self.sensors):
             raise ValueError("held_out_sensor presses with that sensor alone: leave out makes and sensors")
 

@@ -71,11 +71,11 @@ def export(
                 quantise(partial / MODEL, list(graph.inputs), _examples(graph, pack))
         with work("checking the outputs of the export"):
             wanted = reference(model, graph, pack, rows)
-
-            def check(call: Call) -> dict[str, Any]:
-                return parity(graph, call, pack, rows, wanted, **config.tolerance)
-
-            runtime, call, report = _checked(partial / MODEL, config.precision, check)
+            runtime, call, report = _checked(
+                partial / MODEL,
+                config.precision,
+                lambda call: parity(graph, call, pack, rows, wanted, **config.tolerance),
+            )
             report["size_mb"] = round((partial / MODEL).stat().st_size / 1e6, 2)
             report["latency_ms"] = latency(call, [pack.images[m][rows[:1]] for m in graph.modalities])
         # A few real inputs and the outputs of the trained model, which ``Engine`` repeats where it is opened.
@@ -95,9 +95,7 @@ def export(
     return report
 
 
-def _checked(
-    path: Path, precision: str, check: Callable[[Call], dict[str, Any]]
-) -> tuple[Runtime, Call, dict[str, Any]]:
+def _checked(path: Path, precision: str, check: Callable[[Call], Any]) -> tuple[Runtime, Call, dict[str, Any]]:
     """The first runtime whose outputs are those of the model, and the report of its ``check``.
 
     OpenVINO 2026.4 computes some int8 networks wrongly, such as a ResNet whose features are means of all its stages.

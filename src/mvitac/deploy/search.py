@@ -17,7 +17,7 @@ import torch
 from mvitac.data.pack import Pack
 from mvitac.evaluation.features import features, fitting
 from mvitac.model import Model
-from mvitac.registry import from_json, unknown
+from mvitac.registry import check_known, from_json
 from mvitac.system.files import fields_of, write_atomic
 from mvitac.transforms.preprocess import ImageInput
 
@@ -80,8 +80,7 @@ class Embeddings:
         """
         if k < 1:
             raise ValueError(f"num {k}: give 1 or more")
-        if target not in self.banks:
-            raise unknown("modality", target, self.banks)
+        check_known("modality", [target], self.banks)
         if source != target and not self.shared:
             raise ValueError(f"{self.file} holds features, where {source} finds no {target}: embed with --shared")
         x = model.embed(**{source: images}, background=background, shared=self.shared)[source]
