@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,14 @@ from support.toy import Toy, toy_pack
 from support.training_runs import assert_equal_weights, power_cut, smoke
 
 ASKED = Finetuning(labels=("pattern",), lr=(1e-3, 3e-3), steps=(3,), batch_size=16)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_precision() -> Iterator[None]:
+    """auto measures, and on a busy machine two equal runs would differ."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mvitac.system.device.has_bf16", lambda device: False)
+        yield
 
 
 @pytest.fixture
