@@ -246,6 +246,9 @@ def test_scores_on_val_are_not_taken_for_those_on_test(pack: Pack, tmp_path: Pat
     assert ON_VAL in scores["notes"] and ON_VAL in " ".join(str(scores).split())
     assert stored_result([tmp_path / "run"], data.open()) is not None
     assert stored_result([tmp_path / "run"], pack) is None
+    for text in ("[]", "{}"):
+        (tmp_path / "run" / "probe.json").write_text(text)
+        assert stored_result([tmp_path / "run"], data.open()) is None
 
 
 def test_numbers_of_rows_are_no_groups(pack: Pack) -> None:

@@ -27,7 +27,7 @@ from mvitac.nn.encoders import build_trunk
 from mvitac.registry import check_known, from_json, to_json
 from mvitac.run import Run, load_run
 from mvitac.shipped import BASE, named
-from mvitac.system.files import check_place, digest_file, read_json, write_json
+from mvitac.system.files import check_place, digest_file, fields_of, read_json, write_json
 from mvitac.system.progress import work
 from mvitac.system.threads import in_threads
 
@@ -235,15 +235,16 @@ def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:
     if not path.exists():
         return None
     try:
-        result = read_json(path, "a probe result")
-        asked: ProbeConfig = from_json(ProbeConfig, result["asked"], "asked")
+        with fields_of(path):
+            result = read_json(path, "a probe result")
+            asked: ProbeConfig = from_json(ProbeConfig, result["asked"], "asked")
+            scored = {Path(r["run"]).resolve() for r in result["records"] if "run" in r}
+            # Of one pack, the notes tell scores on val from those on test.
+            same = (result["pack"], result["notes"]) == (pack.digest, list(pack.spec.notes))
+            same &= result["models"] == _digests(paths)
     except ValueError as error:
         print(f"mvitac: {error}; the runs are probed again", file=sys.stderr)
         return None
-    scored = {Path(r["run"]).resolve() for r in result["records"] if "run" in r}
-    # Of one pack, the notes tell scores on val from those on test.
-    same = (result["pack"], result["notes"]) == (pack.digest, list(pack.spec.notes))
-    same &= result["models"] == _digests(paths)
     whole = asked.probes[0] == "linear" and asked.controls and not asked.tasks and not asked.modalities
     whole &= not asked.standardise
     return result if same and whole and scored == {path.resolve() for path in paths} else None
