@@ -238,6 +238,21 @@ def test_equal_checksums_by_chance_are_no_leak(pack: Pack) -> None:
     assert not known_images(pack, rows, np.concatenate([one, others])).any()
 
 
+def test_data_that_changed_since_training_is_said(
+    pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = Path(shutil.copytree(pack.path, tmp_path / "pack"))
+    run, asked = train(smoke(Pack(place), steps=1), tmp_path / "run", quiet=True), ProbeConfig(controls=False)
+    again = ["pretrain", "--from", str(run / "run.json"), "--quiet", "--out"]
+    assert not probe_runs([run], asked)["notes"] and main([*again, str(tmp_path / "a")]) == 0
+    assert "warning" not in capsys.readouterr().err
+    shutil.rmtree(place)
+    build(Toy(num=96), place, size=pack.size, quiet=True)
+    (note,) = probe_runs([run], asked)["notes"]
+    assert "other data than is at its place now" in note and main([*again, str(tmp_path / "b")]) == 0
+    assert "its data is not that of" in capsys.readouterr().err
+
+
 def test_scores_on_val_are_not_taken_for_those_on_test(pack: Pack, tmp_path: Path) -> None:
     """Both are of one pack, so its digest does not tell them apart: the note does."""
     data = PackConfig(path=pack.path, score_on="val")

@@ -1,5 +1,6 @@
 """``mvitac pretrain``."""
 
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -47,9 +48,14 @@ def pretrain(argv: list[str]) -> None:
     """
     usual = _Options(run=base, out=Path("runs") / f"{base.data.name}-{base.method.name}-{base.recipe}")
     options, pack = parse(_Options, rest, "pretrain", default=usual, description=description), None
-    if base.data.phased is None and "--from" not in chosen:  # the recipe depends on what the opened data says
+    if "--from" in chosen or base.data.phased is None:
         check_out(options.out, options.resume)
         pack = open_pack(options.run.data, join(), options.quiet)
+    if pack and "--from" in chosen:
+        known = load_run(Path(chosen["--from"]))[1].get("pack", pack.digest)
+        if pack.digest != known and options.run.data == base.data:
+            print(f"mvitac: warning: its data is not that of {chosen['--from']} any more", file=sys.stderr)
+    elif pack:  # the recipe depends on what the opened data says
         options = parse(_Options, rest, "pretrain", default=replace(usual, run=_chosen_run(chosen, rest, pack.phased)))
     with open_loggers(chosen.get("--logger"), options.out, options.run) as loggers:
         out = train(options.run, options.out, resume=options.resume, quiet=options.quiet, loggers=loggers, pack=pack)

@@ -115,8 +115,7 @@ def to_rgb(image: Image.Image, span: Sequence[float] | None = None) -> Image.Ima
         raise ValueError(f"it is read as {image.mode} of 8 bits: --data.range is for gray images of more")
     if image.mode in ("LA", "La", "PA", "RGBA", "RGBa") or "transparency" in image.info:
         image = image.convert("RGBA")
-        black = Image.new("RGBA", image.size, (0, 0, 0, 255))
-        image = Image.alpha_composite(black, image)
+        image = Image.alpha_composite(Image.new("RGBA", image.size, (0, 0, 0, 255)), image)
     return image if image.mode == "RGB" else image.convert("RGB")
 
 

@@ -87,8 +87,7 @@ def frames_of(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray, np.nd
     for rows in recordings(pack, place):
         times = place[rows]
         if (same := np.diff(times) == 0).any():
-            at = times[int(np.flatnonzero(same)[0])]
-            two = f"two rows of touch {_touch(pack, rows)!r} have {name} {at:g}"
+            two = f"two rows of touch {_touch(pack, rows)!r} have {name} {times[int(np.flatnonzero(same)[0])]:g}"
             raise ValueError(f"{two}: pack with --touch-group RECORDING, or name another --data.order")
         if window.frames > 1 and len(times) > 2 and (step := np.median(np.diff(times))) > 1.25 * window.stride:
             far = f"the distance of frames in touch {_touch(pack, rows)!r}, {step:g} (column {name})"

@@ -212,8 +212,7 @@ def _tasks(root: Path, info: dict[str, Any]) -> dict[str, str]:
     """Return the text of each task_index."""
     file = root / "meta" / ("tasks.parquet" if _is_new(info) else "tasks.jsonl")
     with fields_of(file):
-        rows = _rows(file) if file.is_file() else []
-        pairs = [(str(row.pop("task_index")), row.popitem()[1]) for row in rows]
+        pairs = [(str(row.pop("task_index")), row.popitem()[1]) for row in (_rows(file) if file.is_file() else [])]
     if len(tasks := dict(pairs)) < len({*pairs}):
         raise ValueError(f"{file} has a task_index with two texts: fetch it again")
     return tasks

@@ -48,8 +48,7 @@ class SlipGSMiniConfig(RowsConfig):
         for first in sorted(root.glob("**/exp_num_*/camera_0.avi")):
             folder = first.parent
             if all((folder / name).is_file() for name in FINGERS.values()):
-                both = tuple(digest_file(folder / name) for name in FINGERS.values())
-                copies.setdefault(both, []).append(folder)
+                copies.setdefault(tuple(digest_file(folder / name) for name in FINGERS.values()), []).append(folder)
         rows: list[dict[str, str]] = []
         for folders in copies.values():  # of one recording
             folder = folders[0]

@@ -50,8 +50,7 @@ class VT60Config(RowsConfig):
                 at = re.search(r"_at_(-?\d+)_(-?\d+)_(-?\d+)$", touch.stem)
                 pose = dict(zip("xyz", at.groups() if at else ("", "", ""), strict=True))
                 rows.append({**images, "category": thing.split("/")[0], "object": thing, "seq": str(k), **pose})
-        strata = [row["category"] for row in rows]
-        add_folds(rows, strata, 3)
+        add_folds(rows, [row["category"] for row in rows], 3)
         return Manifest.of(root, rows)
 
 

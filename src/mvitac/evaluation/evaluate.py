@@ -2,6 +2,8 @@
 
 import sys
 from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -84,7 +86,7 @@ def probe_runs(
     others = open_encoders(encoders, pack)
     models = [load(path, weights) for path in paths]
     names = [name + ", best" * (weights == "best") for name in names_of(paths, models)]
-    pack = _common_pack(models, pack)
+    pack = _common_pack(paths, models, pack)
     tasks, modalities = chosen(pack, session)
     _check_names({*names}, {model.title for model, _ in others}, {*CONTROLS, *pack.spec.controls})
     for model in models:
@@ -190,7 +192,7 @@ def as_trained(model: Model, pack: Pack) -> Pack:
     return pack if pack.spec.window.active or isinstance(pack, JoinedPack) else windowed(pack, model.spec.window)
 
 
-def _common_pack(models: Sequence[Model], pack: Pack | None) -> Pack:
+def _common_pack(paths: Sequence[Path], models: Sequence[Model], pack: Pack | None) -> Pack:
     if len({model.spec.window for model in models}) > 1:
         raise ValueError("these runs see different windows of frames: probe them one by one, or `mvitac compare` them")
     if pack:
@@ -198,7 +200,16 @@ def _common_pack(models: Sequence[Model], pack: Pack | None) -> Pack:
     packs = [model.open_data() for model in models]
     if len({p.digest for p in packs}) > 1:
         raise ValueError("these runs were trained on different data: probe them one by one, or on one pack with --on")
-    return packs[0]
+    found, own = copy(packs[0]), {_trained_on(path) for path in paths}
+    if own - {None, found.digest}:
+        changed = "the runs were trained on other data than is at its place now"
+        found.spec = replace(found.spec, notes=(*found.spec.notes, changed))
+    return found
+
+
+def _trained_on(path: Path) -> str | None:
+    """The digest of the pack that the run at ``path`` was trained on, if it is known."""
+    return load_run(path)[1].get("pack") if (path / "run.json").exists() else None
 
 
 def _probe_models(
@@ -265,10 +276,9 @@ def check_unseen(
     """
     scored, sources = Scored(pack), []
     for path in paths:
-        digest = (load_run(path)[1] if (path / "run.json").exists() else {}).get("pack")
         sources.append(learned := read_sources(path, weights))
         own = 1 + any(source.name.endswith(CHOSE) for source in (learned or [])[1:2])  # the run's own rows
-        refused = [] if allow_leak else (learned or [])[own if digest == pack.digest else 0 :]
+        refused = [] if allow_leak else (learned or [])[own if _trained_on(path) == pack.digest else 0 :]
         for task in tasks if refused else ():
             if (leak := scored.leak(refused, split_rows(pack, task).test)) not in ("", UNKNOWN):
                 seen = f"{path} has seen what {pack.path} would score, task {task.name!r}: {leak}"

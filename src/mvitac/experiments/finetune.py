@@ -33,6 +33,7 @@ from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import Model, fresh, load
 from mvitac.nn.encoders import IMAGENET, EncoderConfig, Encoders
 from mvitac.nn.initial import Init
+from mvitac.registry import from_json
 from mvitac.run import Optim, Run, load_run
 from mvitac.system.files import check_place, digest, read_json, write_json
 from mvitac.system.progress import duration
@@ -270,7 +271,8 @@ def _choose(job: _Job, percent: float, kind: str) -> dict[str, Any]:
 def _held_out_error(job: _Job, percent: float, kind: str, settings: dict[str, Any]) -> float:
     """``mean_error`` on held-out groups; from choice.json if these settings were tried on this data before."""
     file, work = job.folder(percent) / "choice.json", job.folder(percent) / "choice"
-    tried: dict[str, dict[str, list[float]]] = read_json(file, "what was tried") if file.exists() else {}
+    known = read_json(file, "what was tried") if file.exists() else {}
+    tried = from_json(dict[str, dict[str, list[float]]], known, f"{file}: tried")
     run = job.run_of(percent, 0, kind, settings, hold_out=True)
     key = digest([run.digest(), job.pack.digest])[:8]
     name = f"{kind}: {', '.join(f'{name} {value}' for name, value in settings.items())} ({key})"

@@ -123,7 +123,9 @@ class Live:
         # A newer frame may have come since ``leading`` was read: the one that is used counts.
         self._seen = (frames[self._leads][0] or leading).number
         now = self.clock()
-        if not self._all_fresh(frames, now):
+        # Every stream must have a frame that shows the present; an old one would give an answer about the past.
+        pairs = zip(self.all, (frame for found in frames.values() for frame in found), strict=True)
+        if not all(f and stream.fault != "frozen" and now - f.time <= stream.stale_after for stream, f in pairs):
             self.num_stale += 1
             self._lose()
             return False
@@ -167,14 +169,6 @@ class Live:
         """``tick``, and what is new: a prediction, or that a touch has ended, JSON-ready; else None."""
         before = self.touch is not None
         return self.prediction() if self.tick() or (before and self.touch is None) else None
-
-    def _all_fresh(self, frames: dict[str, list[Frame | None]], now: float) -> bool:
-        """Whether every stream has a frame that shows the present; an old one would give an answer about the past."""
-        return all(
-            frame is not None and stream.fault != "frozen" and now - frame.time <= stream.stale_after
-            for several, found in zip(self.streams.values(), frames.values(), strict=True)
-            for stream, frame in zip(several, found, strict=True)
-        )
 
     def finish(self) -> None:
         """End the current touch."""

@@ -137,8 +137,7 @@ class IJEPA(Contrastive):
     def blocks(self, batch: Views, modality: str) -> Blocks:
         """The blocks of each image that the ViT of ``modality`` sees."""
         trunk, stream = self.trunks[modality], list(self.trunks).index(modality)
-        grid = vit.grid_of(trunk, batch.images[modality][0])
-        return multi_block(self.config, batch.seed, batch.rows, stream, grid)
+        return multi_block(self.config, batch.seed, batch.rows, stream, vit.grid_of(trunk, batch.images[modality][0]))
 
     def queries(self, batch: Views) -> Embeddings:
         """("predicted", modality) -> [B, M S, D]."""

@@ -74,8 +74,7 @@ class MAE(Contrastive):
             images = batch.images[modality][0]
             noise = vit.row_uniform(batch.seed, batch.rows, math.prod(vit.grid_of(trunk, images)), stream)
             visible, hidden = split_patches(noise, self.config.mask_ratio)
-            seen = vit.encode_visible(trunk, images, visible)
-            predicted = self.decoders[modality](seen, hidden[:, None])[:, 0]
+            predicted = self.decoders[modality](vit.encode_visible(trunk, images, visible), hidden[:, None])[:, 0]
             with torch.autocast(images.device.type, enabled=False):
                 values = vit.take(vit.patches(trunk, images.float()), hidden)
                 if self.config.pixel_norm:

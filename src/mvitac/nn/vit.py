@@ -86,8 +86,7 @@ def grid_of(trunk: nn.Module, images: Tensor) -> tuple[int, int]:
 def patches(trunk: nn.Module, images: Tensor) -> Float[Tensor, "B N P"]:
     """The pixels of each patch, P = C x side x side. Like timm's ViT, images are padded at the bottom and the right."""
     side = vit_of(trunk).patch_embed.patch_size[0]
-    padding = (0, -images.shape[3] % side, 0, -images.shape[2] % side)
-    return F.unfold(F.pad(images, padding), side, stride=side).mT
+    return F.unfold(F.pad(images, (0, -images.shape[3] % side, 0, -images.shape[2] % side)), side, stride=side).mT
 
 
 def take(tokens: Float[Tensor, "B N D"], at: Int[Tensor, "B K"]) -> Float[Tensor, "B K D"]:
@@ -173,5 +172,4 @@ class Predictor(nn.Module):
         if live is not None:
             assert seen.live is not None
             shown = torch.cat([seen.live[:, None].expand(-1, num_sets, -1), live], dim=2).flatten(0, 1)
-        predicted = _pass(self.blocks, tokens, shown)[:, -length:]
-        return self.out(self.norm(predicted)).unflatten(0, (-1, num_sets))
+        return self.out(self.norm(_pass(self.blocks, tokens, shown)[:, -length:])).unflatten(0, (-1, num_sets))

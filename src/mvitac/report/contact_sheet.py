@@ -46,8 +46,7 @@ def samples(pack: Pack) -> list[Block]:
             of = f", {num} {pack.spec.group_by}s" * (num > 1)
             chosen = _spread(rows, groups[rows] if num > 1 else pack.touch_groups[rows], rng)
             found.append((f"{name}: {len(rows)} row{'s' * (len(rows) > 1)}{of}", _tiles(pack, chosen)))
-    left_out = [(f"{len(found) - LIMIT} more are not shown", [])] * (len(found) > LIMIT)
-    return [*found[:LIMIT], *left_out]
+    return [*found[:LIMIT], *[(f"{len(found) - LIMIT} more are not shown", [])] * (len(found) > LIMIT)]
 
 
 def _spread(rows: np.ndarray, groups: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -60,8 +60,7 @@ def mistakes(study: Study) -> list[Markup]:
                 image, name = _picture(study, modality, other)
                 cells.append(html.cell(css, image, mark, name))
             strips.append(html.grid(cells, "query"))
-        title = f"{modality}: {wrong.sum()} of {len(shown)} rows" if known else modality
-        halves.append(html.card(title, strips))
+        halves.append(html.card(f"{modality}: {wrong.sum()} of {len(shown)} rows" if known else modality, strips))
     by, name = pack.spec.group_by, study.runs[0].path.name
     intro = f"Each row is the one least like all above it{', so label these first' * (not pack.spec.all_tasks)}."
     if known:

@@ -46,8 +46,7 @@ class View:
         self.exposure = rng.uniform(0.75, 1.25)
         self.table = str(rng.choice(TABLES))
         color = rng.uniform(0.25, 0.85) * rng.normal(1, 0.12, 3)
-        related = color * rng.uniform(0.7, 1.3) + rng.normal(0, 0.03, 3)
-        self.table_colors = np.clip([color, related], 0.02, 0.95)
+        self.table_colors = np.clip([color, color * rng.uniform(0.7, 1.3) + rng.normal(0, 0.03, 3)], 0.02, 0.95)
         self.table_turn = rng.uniform(0, np.pi)
         self.table_scale = rng.uniform(0.02, 0.07)
         self.wall_colors = rng.uniform(0.05, 0.85, (3, 3))  # bottom, top, and a soft stain
