@@ -174,6 +174,11 @@ def test_folds_test_every_group_once_that_no_run_learned_from(pack: Pack, runs: 
             assert min(np.bincount(pack.labels(task.name)[split == "test"], minlength=3)) > 0
     with pytest.raises(ValueError, match=r"task 'pattern' has 60 instances .* too few for 61 folds"):
         fold_splits(pack, task, 61, [])
+    few = np.full(pack.num, -1)
+    few[[np.flatnonzero(pack.column("label_pattern") == k)[0] for k in range(3)]] = range(3)  # one row of each class
+    assert [list(split).count("test") for split in fold_splits(with_columns(pack, label_pattern=few), task, 3, [])] == [
+        1
+    ] * 3
     before = (runs[0] / "probe.json").exists()
     found = probe_runs(runs, ProbeConfig(folds=3, tasks=("pattern", "bright"), modalities=("touch",)))
     num = len(pack.rows("val", "test"))

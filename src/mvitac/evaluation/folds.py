@@ -29,13 +29,15 @@ def fold_splits(pack: Pack, task: AnyTask, num: int, learned: Sequence[Source]) 
     rows = np.flatnonzero(known & ~seen)
     groups = pack.column("group")[rows].astype(str)
     if (left := len(set(groups))) < num:
-        by = pack.spec.group_by
-        raise ValueError(f"task {task.name!r} has {left} {by}s that no run learned from, too few for {num} folds")
+        free = f"{left} {pack.spec.group_by}s that no run learned from"
+        raise ValueError(f"task {task.name!r} has {free}, too few for {num} folds")
     if isinstance(task, ValueTask):
         first = np.nan_to_num(pack.values(task)[rows, 0])
         strata = np.searchsorted(np.quantile(first, [0.25, 0.5, 0.75]), first)
     else:
         strata = pack.labels(task.name)[rows]
+    if np.unique(strata, return_counts=True)[1].max() < num:  # none can be shared out
+        strata = np.zeros(len(rows), int)
     found = []
     for _, test in StratifiedGroupKFold(num, shuffle=True, random_state=0).split(rows, strata, groups):
         split = np.where(known, "train", "hidden")

@@ -116,8 +116,7 @@ def load_weights(network: nn.Module, tensors: State, file: Path | str) -> None:
     if len(fitting) != 1 or rivals:
         two = f"two sets of weights fit, below {' and '.join(map(repr, [*fitting, *rivals]))}"
         why = two if fitting else max(reasons.values(), key=lambda reason: reason[0])[1]
-        name = _cfg(network).get("architecture", type(network).__name__)
-        raise ValueError(f"{file} does not fit {name}: {why}")
+        raise ValueError(f"{file} does not fit {_cfg(network).get('architecture', type(network).__name__)}: {why}")
     ((start, state),) = fitting.items()
     if bad := [name for name, value in state.items() if value.is_floating_point() and not value.isfinite().all()]:
         raise ValueError(f"{file} holds NaN or infinite numbers: {_some(bad)}")

@@ -54,8 +54,7 @@ def examine(pack: Pack, *, part: bool = False) -> list[Finding]:
     looks = look_at(pack)
     labels = [*table_checks.labels(pack), *value_checks.values(pack)]
     if part:
-        note = "in the items examined: "
-        milder = [replace(f, verdict="look", evidence=note + f.evidence) for f in labels]
+        milder = [replace(f, verdict="look", evidence="in the items examined: " + f.evidence) for f in labels]
         labels = [mild if f.verdict == "broken" else f for f, mild in zip(labels, milder, strict=True)]
     return [
         table_checks.unreadable(pack),
