@@ -64,7 +64,7 @@ class Recorded(Source):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kind", default="straight", help="straight, curved, corner or surface")
+    parser.add_argument("--kind", default="straight", choices=("straight", "curved", "corner", "surface"))
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
