@@ -26,6 +26,7 @@ from mvitac.evaluation.probe import probe_model
 from mvitac.experiments.finetune import FROZEN, SCRATCH, TUNED, Finetuning, _start, finetune
 from mvitac.model import load
 from mvitac.nn.encoders import EncoderConfig
+from mvitac.report.tables import print_finetuning
 from mvitac.run import load_run
 from mvitac.system.files import read_json
 from mvitac.training.loop import train
@@ -99,6 +100,19 @@ def test_the_command_continues_a_finished_one_and_prints_one_table(
     assert "40 % of instances" in said and "100 % of instances" in said
     assert "no gain over the frozen probe is sure" in said
     assert numbers[gains[0]] == pytest.approx(numbers["fine-tuned"] - numbers[SCRATCH], abs=0.11)
+
+
+def test_a_gain_over_few_groups_has_no_interval(capsys: pytest.CaptureFixture[str]) -> None:
+    """Two equal gaps would say that it is certain."""
+    for num, shown in ((2, 2), (20, 4)):
+        known: dict[str, Any] = {"task": "kind", "modality": "touch", "probe": "linear", "fraction": 100.0, "seed": 0}
+        known |= {"group_sizes": [10] * num, "accuracy": 0.5, "leak": ""}
+        records = [
+            known | {"source": s, "group_correct": [k] * num} for s, k in ((TUNED, 4), (SCRATCH, 6), (FROZEN, 5))
+        ]
+        print_finetuning({"data": "d", "group_by": "object", "notes": [], "records": records})
+        gains = [line for line in capsys.readouterr().out.splitlines() if line.startswith("gain")]
+        assert sum(line.count("[") for line in gains) == shown - 2, gains
 
 
 @pytest.mark.parametrize(

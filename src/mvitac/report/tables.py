@@ -7,7 +7,7 @@ from typing import Any, TextIO
 from tabulate import tabulate
 
 from mvitac.evaluation import score_text
-from mvitac.evaluation.intervals import interval, paired_difference
+from mvitac.evaluation.intervals import MIN_GROUPS, interval, num_groups_of, paired_difference
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import VALUE_PROBES
 from mvitac.evaluation.score_text import columns_of, error_text, headline, percent, sources_of, with_interval
@@ -151,7 +151,8 @@ def print_finetuning(result: dict[str, Any], file: TextIO | None = None) -> None
             rows.append([source, *(text.replace(" LEAK", "\nLEAK") for text in texts)])
         for source, found in others:
             gaps = (paired_difference(ours[fraction], found[fraction])[:3] for fraction in ours)
-            texts = (f"{100 * mean:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]" for mean, low, high in gaps)
+            whole = " [{:+.1f}, {:+.1f}]" if num_groups_of(next(iter(ours.values()))[0]) >= MIN_GROUPS else ""
+            texts = (f"{100 * mean:+.1f}" + whole.format(100 * low, 100 * high) for mean, low, high in gaps)
             rows.append([f"gain over {source}", *texts])
         print(text_table(f"{result['data']}: {task}", columns, rows), file=file)
     _print_notes(result, result["records"], file)
