@@ -53,7 +53,7 @@ def pretrain(argv: list[str]) -> None:
         pack = open_pack(options.run.data, join(), options.quiet)
     if pack and "--from" in chosen:
         known = load_run(Path(chosen["--from"]))[1].get("pack", pack.digest)
-        if pack.digest != known and options.run.data == base.data:
+        if pack.digest != known and options.run.data == base.data and not options.resume:  # which refuses it
             print(f"mvitac: warning: its data is not that of {chosen['--from']} any more", file=sys.stderr)
     elif pack:  # the recipe depends on what the opened data says
         options = parse(_Options, rest, "pretrain", default=replace(usual, run=_chosen_run(chosen, rest, pack.phased)))
