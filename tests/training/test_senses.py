@@ -141,10 +141,12 @@ def test_features_of_all_stages() -> None:
 def test_the_untrained_control_keeps_a_locked_tower(pack: Pack, file: Path) -> None:
     """It is the run before its first step, so the gain by both senses is that of training."""
     run = started(pack, file, locked=True)
-    kept, fresh = _untrained(run).encoder, _untrained(started(pack, file)).encoder
+    trained = started(pack, file)
+    kept, fresh = _untrained(run, [run]).encoder, _untrained(trained, [trained]).encoder
+    assert _untrained(run, [run, trained]).encoder.vision.weights == SCRATCH  # a control for both
     assert kept.vision == run.encoder.vision and {kept.touch.weights, fresh.vision.weights} == {SCRATCH}
     lost = replace(run, encoder=replace(run.encoder, vision=replace(run.encoder.vision, weights="gone.pt")))
-    assert _untrained(lost).encoder.vision.weights == SCRATCH
+    assert _untrained(lost, [lost]).encoder.vision.weights == SCRATCH
 
 
 def test_a_momentum_copy_shares_a_locked_trunk() -> None:

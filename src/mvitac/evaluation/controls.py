@@ -84,7 +84,7 @@ def controls_of(
     with work("fitting probes of the controls", num, "probes"):
         records += pixel_controls(pack, tasks, modalities)
         # Built one by one: threads would share the random generator.
-        models = [fresh(_untrained(run), spec, pack.size) for run, spec in starts]
+        models = [fresh(_untrained(run, runs), spec, pack.size) for run, spec in starts]
         retrieval: Records = []
         scored = in_threads(lambda model: (probed(model), cross_modal(model, pack)), models)
         for (run, _), (found, ranked) in zip(starts, scored, strict=True):
@@ -97,13 +97,14 @@ def controls_of(
     return records, retrieval
 
 
-def _untrained(run: Run) -> Run:
-    """``run`` from random weights; a locked tower, which is not trained, has its own if they are here."""
+def _untrained(run: Run, runs: Sequence[Run]) -> Run:
+    """``run`` from random weights; a tower that all ``runs`` lock, so none trains, has its own if they are here."""
 
     def is_there(config: EncoderConfig) -> bool:
         return bool(imagenet.source(config.trunk)) if config.weights == IMAGENET else Path(config.weights).is_file()
 
-    kept = {m: run.encoder[m] for m in MODALITIES if run.encoder[m].locked and is_there(run.encoder[m])}
+    locked = [m for m in MODALITIES if all(each.encoder[m].locked for each in runs)]
+    kept = {m: run.encoder[m] for m in locked if is_there(run.encoder[m])}
     return replace(run, encoder=replace(run.encoder.fresh(), **kept))
 
 

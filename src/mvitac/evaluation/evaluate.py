@@ -202,8 +202,7 @@ def _common_pack(paths: Sequence[Path], models: Sequence[Model], pack: Pack | No
         raise ValueError("these runs were trained on different data: probe them one by one, or on one pack with --on")
     found, own = copy(packs[0]), {_trained_on(path) for path in paths}
     if own - {None, found.digest}:
-        changed = "the runs were trained on other data than is at its place now"
-        found.spec = replace(found.spec, notes=(*found.spec.notes, changed))
+        found.spec = replace(found.spec, notes=(*found.spec.notes, "the data of these runs changed since training"))
     return found
 
 

@@ -200,7 +200,7 @@ MODE = re.compile(r"(?P<which>.+?)(@(?P<width>\d+)x(?P<height>\d+))?(@(?P<fps>\d
 def crop_of(text: str) -> tuple[str, tuple[int, ...]]:
     """A source's text without ``#x:y:width:height`` at its end, and these numbers; () = all of its images."""
     found = re.fullmatch(r"(.*)#(\d+):(\d+):([1-9]\d*):([1-9]\d*)", text)
-    if not found and re.search(r"#[^/]*:[^/]*$", text):
+    if not found and not Path(text).exists() and re.search(r"#[^/]*:[^/]*$", text):
         raise ValueError(f"source {text!r}: give the part as #x:y:width:height, in pixels")
     return (found[1], tuple(map(int, found.groups()[1:]))) if found else (text, ())
 
@@ -214,7 +214,7 @@ def source(text: str, modality: str) -> Source:
     text, crop = crop_of(text)
     mode = MODE.fullmatch(text)
     if text.partition(":")[0] == "sim":
-        if not (seed := text.removeprefix("sim").removeprefix(":") or "0").isdigit():
+        if not (seed := text.removeprefix("sim").removeprefix(":") or "0").isdecimal():
             raise ValueError(f"source {text!r}: {seed!r} is no seed, a whole number from 0")
         found: Source = Simulated(modality, int(seed))
     elif mode and (mode["which"].isdigit() or text.startswith(("/dev/", "serial:"))):
