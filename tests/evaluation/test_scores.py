@@ -13,7 +13,7 @@ from sklearn.metrics import confusion_matrix, f1_score, precision_score, recall_
 from mvitac.evaluation import diagnostics as d
 from mvitac.evaluation import score_text
 from mvitac.evaluation.controls import label_controls
-from mvitac.evaluation.intervals import interval, least_p, paired_difference
+from mvitac.evaluation.intervals import interval, least_p, mean_interval, paired_difference
 from mvitac.evaluation.scores import per_class, pool_retrieval, score, summarise
 from support.toy import toy_pack
 
@@ -153,6 +153,13 @@ def test_one_seed_has_no_p() -> None:
     assert paired_difference(one, three)[3] is None and paired_difference(three, one)[3] is None
     assert paired_difference(three, control)[3] is not None  # a control without seeds has nothing to vary
     assert paired_difference([record([3], 0)], [record([9], 0)])[1:] == (-1.0, 1.0, None)
+
+
+def test_a_difference_in_under_six_groups_is_never_sure() -> None:
+    """Equal gaps have no variance; a sign test over five groups cannot fall below .05."""
+    for num, low in ((2, 0.0), (5, 0.0), (6, 0.1)):
+        assert paired_difference([record([4] * num, 0)], [record([3] * num, 0)])[:2] == pytest.approx((0.1, low))
+        assert mean_interval(np.full((1, num), 0.1))[:2] == pytest.approx((0.1, low))
 
 
 def test_intervals_stay_within_0_and_1_are_never_empty_and_count_groups_with_rows() -> None:

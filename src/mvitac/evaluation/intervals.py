@@ -80,7 +80,7 @@ def paired_difference(
     paired = [r["seed"] for r in ours] == [r["seed"] for r in theirs]
     seeds = _over_seeds(a - b, sizes) if paired else _over_seeds(a, sizes) + _over_seeds(b, sizes)
     groups = _over_groups(a.mean(0) - b.mean(0), sizes)
-    margin = _margin(groups, seeds)
+    margin = _margin_beside_0(mean, groups, seeds, len(sizes))
     p = None if one_seed else max(_p(mean, groups + seeds), _p(mean, seeds) if seeds.value else 0, least_p(len(sizes)))
     return mean, max(-most, mean - margin), min(most, mean + margin), p
 
@@ -91,7 +91,7 @@ def mean_interval(values: np.ndarray) -> tuple[float, float, float, float]:
         return float(values.mean()), -math.inf, math.inf, 1.0
     sizes, mean = np.ones(values.shape[1]), float(values.mean())
     groups, seeds = _over_groups(values.mean(0), sizes), _over_seeds(values, sizes)
-    margin = _margin(groups, seeds)
+    margin = _margin_beside_0(mean, groups, seeds, len(sizes))
     p = max(_p(mean, groups + seeds), _p(mean, seeds) if seeds.value else 0, least_p(values.shape[1]))
     return mean, mean - margin, mean + margin, p
 
@@ -193,6 +193,14 @@ def _over_seeds(correct: np.ndarray, sizes: np.ndarray) -> _Variance:
 def _margin(groups: _Variance, seeds: _Variance) -> float:
     """Half the width of the 95 % interval."""
     return max(float(stdtrit(v.freedom, 0.975)) * v.value**0.5 for v in (groups + seeds, seeds))
+
+
+def _margin_beside_0(mean: float, groups: _Variance, seeds: _Variance, num_groups: int) -> float:
+    """``_margin`` of a mean that 0 is compared with: where p is always above .05, the interval has 0 in it.
+
+    Two groups of equal gaps would otherwise give an interval of no width.
+    """
+    return max(_margin(groups, seeds), abs(mean) if least_p(num_groups) > 0.05 else 0)
 
 
 def _p(mean: float, variance: _Variance) -> float:
