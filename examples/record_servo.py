@@ -68,4 +68,6 @@ if __name__ == "__main__":
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
+    if options.episodes < 1:
+        parser.error(f"--episodes {options.episodes}: give 1 or more")
     print(build(Recorded(options.kind, options.episodes), options.out, size=SIZE, workers=0, quiet=True))

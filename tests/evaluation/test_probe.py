@@ -290,6 +290,18 @@ def test_runs_of_other_data_and_settings_are_no_seeds_of_one_another(runs: list[
         probe_runs([*runs, again], session)
 
 
+def test_classes_that_train_lacks_are_named_below_the_scores(runs: list[Path], pack: Pack) -> None:
+    labels, test = pack.labels("pattern").copy(), pack.rows("test")
+    for rows in (pack.rows("train"), pack.rows("val")):
+        labels[rows] = labels[rows] % 2  # nothing is a "rows"
+    asked = ProbeConfig(probes=("knn",), tasks=("pattern",), modalities=("touch",), controls=False)
+    found = probe_runs(runs[:1], asked, with_columns(pack, label_pattern=labels))
+    num = (labels[test] == 2).sum()
+    assert found["notes"] == [
+        f"pattern: {num} of {len(test)} test rows have classes that train lacks: {pack.spec.tasks[0].classes[2]}"
+    ]
+
+
 def test_seeds_whose_automatic_precision_differs_are_seeds_of_one_run(pack: Pack, tmp_path: Path) -> None:
     """Noise of the clock may give one seed bf16 and the next fp32."""
     run, paths = replace(recipe("smoke", PackConfig(path=pack.path)), steps=1, precision="auto"), []

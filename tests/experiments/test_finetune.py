@@ -258,6 +258,8 @@ def test_bad_input_is_refused_before_anything_is_written(
         assert main(command) == 2
         said = capsys.readouterr().err
         assert said.count("\n") == 1 and all(word in said for word in words), said
+    assert main(["finetune", run, "--data", str(pack.path), "--values", "pattern", "--out", str(out)]) == 2
+    assert "pattern: --labels is for tasks with classes" in capsys.readouterr().err
     assert not out.exists()
 
 

@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack
 from mvitac.data.spec import AnyTask, Task, ValueTask
@@ -100,7 +102,7 @@ def probe_runs(
         records, retrieval = _in_folds(score, pack, others, tasks, session.folds, sources), []
         tested = [f"{session.folds} folds: every {pack.spec.group_by} that no run learned from is tested once"]
     else:
-        (records, retrieval), tested = score(pack, others, tasks), []
+        (records, retrieval), tested = score(pack, others, tasks), _unlearned(pack, tasks)
     leaks = [*leaks_of(every := [*records, *retrieval]), *([] if session.folds else mark_split_leaks(pack, every))]
     classes = {task.name: list(task.classes) for task in tasks if isinstance(task, Task)}
     result = {
@@ -206,6 +208,18 @@ def _common_pack(paths: Sequence[Path], models: Sequence[Model], pack: Pack | No
     return found
 
 
+def _unlearned(pack: Pack, tasks: Sequence[AnyTask]) -> list[str]:
+    """A line for each task with test rows of classes that no probe learns, so that all answers for them are wrong."""
+    lines = []
+    for task in (task for task in tasks if isinstance(task, Task)):
+        rows, labels = split_rows(pack, task), pack.labels(task.name)
+        new = np.setdiff1d(tested := labels[rows.test], labels[rows.fitted])
+        named, num = ", ".join(task.classes[label] for label in new), np.isin(tested, new).sum()
+        if named:
+            lines.append(f"{task.name}: {num} of {len(tested)} test rows have classes that train lacks: {named}")
+    return lines
+
+
 def _trained_on(path: Path) -> str | None:
     """The digest of the pack that the run at ``path`` was trained on, if it is known."""
     return load_run(path)[1].get("pack") if (path / "run.json").exists() else None
@@ -250,7 +264,8 @@ def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:
             asked: ProbeConfig = from_json(ProbeConfig, result["asked"], "asked")
             scored = {Path(r["run"]).resolve() for r in result["records"] if "run" in r}
             # Of one pack, the notes tell scores on val from those on test.
-            same = (result["pack"], result["notes"]) == (pack.digest, list(pack.spec.notes))
+            notes = [*pack.spec.notes, *_unlearned(pack, pack.spec.all_tasks)]
+            same = (result["pack"], result["notes"]) == (pack.digest, notes)
             same &= result["models"] == _digests(paths)
     except ValueError as error:
         print(f"mvitac: {error}; the runs are probed again", file=sys.stderr)
