@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import timm
 import torch
@@ -26,9 +27,9 @@ from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import features
 from mvitac.model import fresh
 from mvitac.system.files import digest
-from support.forged_packs import Change, put
+from support.forged_packs import Change, put, seal
 from support.pages import drawings
-from support.toy import toy_pack
+from support.toy import toy_pack, with_columns
 
 RANDOM = "external:timm/test_resnet,weights=random,size=32,seed={}"
 SUITE = f"""
@@ -177,6 +178,23 @@ def test_the_same_suite_twice_gives_the_same_digest_and_continues(
     assert {part.name.partition("-")[0] for part in (tmp_path / "parts").iterdir()} == {"controls"}
 
 
+def test_controls_of_the_data_that_changed_are_scored_again(
+    results: list[Path], smoke_run: Path, root: Path, tmp_path: Path
+) -> None:
+    """A pack's digests of images and rows have no controls; a page does not mix both."""
+    toys, out = find_suite(str(root / "toys.toml")), shutil.copytree(root, tmp_path / "root")
+    pack = Pack(out / "stripes")
+    table = with_columns(pack, noise=pack.labels("pattern").astype(float)).table
+    pq.write_table(table, pack.path / "samples.parquet")
+    seal(pack.path)
+    second = run_bench([str(smoke_run)], toys, out / "results", out, About(name="again"))
+    told = [read_result(path)["blocks"] for path in (results[0], second)]
+    noise = [[r["sums"] for r in blocks[0]["records"] if r["source"] == "noise only"] for blocks in told]
+    assert told[0][0]["data"] == told[1][0]["data"] and noise[0] != noise[1]
+    with pytest.raises(ValueError, match="the control noise only differs between"):
+        gather({path.stem: read_result(path) for path in (results[0], second)})
+
+
 def test_what_is_not_there_is_said(results: list[Path], root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     blocks = read_result(results[0])["blocks"]
     assert blocks[3]["not_run"].endswith("elsewhere is not there") and blocks[2]["form"] == "copy"
@@ -269,15 +287,21 @@ def all_right(value: dict[str, Any]) -> None:
     record["sums"]["correct"] = record["sums"]["n"]
 
 
-def not_run(block: dict[str, Any]) -> None:
+def not_run(block: dict[str, Any], why: str = "no time") -> None:
     for key in block.keys() - {"set", "task"}:
         del block[key]
-    block["not_run"] = "no time"
+    block["not_run"] = why
+
+
+def no_touch(value: dict[str, Any]) -> None:
+    """One task is left out, as if the encoder had no touch, which other tasks have scores of."""
+    del value["encoder"]["parameters"]["touch"]
+    not_run(value["blocks"][1], NO_TOUCH)
 
 
 RECORDS, VALUES = ("blocks", 0, "records"), ("blocks", 1, "records", 0)
 MORE_CORRECT = put(*RECORDS, 0, "sums", "correct", 0, value=1000)
-FEW, NO_VISION = "30 % of labels", "the encoder has no vision"
+FEW, NO_VISION, NO_TOUCH = "30 % of labels", "the encoder has no vision", "the encoder has no touch"
 FORGED: dict[str, tuple[Change, str]] = {
     "correct": (MORE_CORRECT, "more correct rows than rows"),
     "negative squares": (put(*VALUES, "sums", "squared_error", 0, 0, value=-1.0), "squared errors are smaller"),
@@ -302,6 +326,10 @@ FORGED: dict[str, tuple[Change, str]] = {
     "all guesses right": (all_right, "one answer is right for all rows"),
     "clipped": (put(*VALUES, "clipped", value=[9, 4]), "9 of its 4 features were clipped"),
     "excuse": (put("blocks", 0, "left_out", value={"vision": NO_VISION}), NO_VISION),
+    "excuse of a lost encoder": (no_touch, f"stripes, light: {NO_TOUCH}"),
+    "leak": (put("blocks", 0, "leaks", value=[-1]), "a leak mark, a group or what groups are is no text"),
+    "group by": (lambda value: value["blocks"][0].pop("group_by"), "a leak mark, a group or what groups are"),
+    "list for a number": (put("encoder", "images_seen", value=[]), "a.json is damaged"),
     "nothing": (lambda value: [not_run(block) for block in value["blocks"]], "was run on no task"),
     "twice": (put(*RECORDS, value=lambda records: [*records, records[0]]), "is there twice"),
     "modality": (lambda value: drop(value, source="", modality="both"), f"lacks the encoder, both, {FEW}, 0"),
@@ -340,7 +368,7 @@ def test_what_a_result_says_of_rows_and_of_leaks_is_compared(
 ) -> None:
     forged = changed(results[1], tmp_path / "a.json", more_spread, signed=True)
     assert main(["bench", "check", str(forged)]) == 0
-    assert "the majority or mean differs between" in said(capsys, "bench", "board", results[0], forged)
+    assert "the control mean differs between" in said(capsys, "bench", "board", results[0], forged)
     seen = put("encoder", "trained_on", value="ImageNet; toy stripes")
     forged = changed(results[1], tmp_path / "a.json", seen, signed=True)
     assert "its marks of leaks are not those of data trained on, Image" in said(capsys, "bench", "check", forged)

@@ -69,8 +69,26 @@ def test_one_task_if_classes_agree_else_two(pack: Pack, gel: Pack) -> None:
         expected = np.full(mix.num, -1)
         expected[first : first + part.num] = part.labels("bright")
         np.testing.assert_array_equal(mix.labels(name), expected)
-    assert mix.spec.controls == {"noise only": ("noise",)}  # a column of this name is no control in gel
-    np.testing.assert_array_equal(np.isfinite(mix.column("noise")), mix.column("part") == "toy")
+    assert mix.spec.controls == {"noise only": ("control/noise",)}  # a column of this name is no control in gel
+    np.testing.assert_array_equal(np.isfinite(mix.column("control/noise")), mix.column("part") == "toy")
+
+
+def test_a_control_of_one_part_is_no_value_of_another(gel: Pack, tmp_path: Path) -> None:
+    """Here force is in mN, and nothing that the part measures."""
+    aside = altered(Slice(num=30, first=60), lambda _, item: {"force": 1000.0 * item}, controls={"force": ("force",)})
+    mix = MixedPack({"a": built(pressed(), tmp_path / "a"), "b": built(aside, tmp_path / "b")})
+    (task,) = mix.spec.values
+    inside = mix.column("part") == "a"
+    np.testing.assert_array_equal(np.isfinite(mix.values(task)[:, 0]), inside)
+    assert mix.spec.controls["force"] == ("control/force",)
+    np.testing.assert_array_equal(mix.column("control/force")[~inside], 1000.0 * np.arange(30))
+    assert np.isnan(mix.column("control/force")[inside]).all()
+    other = altered(pressed(60), values=(ValueTask(name="load", targets=(Target(name="force", unit="mN"),)),))
+    names = [
+        task.name
+        for task in MixedPack({"a": built(pressed(), tmp_path / "c"), "b": built(other, tmp_path / "d")}).spec.values
+    ]
+    assert names == ["a/force", "b/load"]
 
 
 def pressed(first: int = 0, unit: str = "N", kind: Any = 1, own_split: bool = False) -> Toy:

@@ -122,8 +122,33 @@ def test_a_row_may_read_the_same_samples_in_another_way(pack: Pack, tmp_path: Pa
     do_all(work, quiet=True)
     packs = {job.label: json.loads((job.out / "run.json").read_text())["pack"] for job in work.jobs}
     assert packs == {"MViTac": pack.digest, "darker": darker.digest}
-    sources = {record["source"] for record in gather(work, tmp_path / "out", session)["records"]}
+    result = gather(work, tmp_path / "out", session)
+    sources = {record["source"] for record in result["records"]}
     assert {"MViTac", "darker"} <= sources
+    assert result["notes"] == ["darker reads other images than the controls"]
+
+
+def test_a_row_may_not_read_other_values(tmp_path: Path) -> None:
+    pack = toy_pack(tmp_path / "pack", values=True)
+    column = pack.spec.values[0].targets[0].name
+    lit = altered(Toy(values=True), lambda sample, _: {column: sample.columns[column] + 1})
+    other = build(lit, tmp_path / "other", size=32, quiet=True)
+    rows = (Row(label="MViTac"), Row(label="other", set={"data.path": str(other.path)}))
+    work = lay_out(small(pack, rows=rows, seeds=1), pack, tmp_path / "out", ProbeConfig())
+    assert f"another column {column}" in work.left_out["other"]
+
+
+def test_scores_that_were_copied_from_another_run_are_computed_again(
+    done: tuple[Path, dict], pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = shutil.copytree(done[0], tmp_path / "out")
+    one, two = sorted(out.rglob("scores.json"))[:2]
+    right = [record["group_correct"] for record in json.loads(two.read_text())["records"]]
+    shutil.copy(one, two)
+    monkeypatch.setattr(Step, "__call__", None)  # nothing is trained again
+    do_all(work := lay_out(small(pack), pack, out, ProbeConfig()), quiet=True)
+    assert [record["group_correct"] for record in json.loads(two.read_text())["records"]] == right
+    assert all(job.done for job in work.jobs)
 
 
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.toml")), ids=lambda file: file.stem)

@@ -111,10 +111,11 @@ def gather(results: dict[str, dict[str, Any]]) -> Board:
             task = f"{one.name}: {ask.name}{f' ({form})' if several else ''}"
             records = []
             # Controls are the same in all results, but that some lack ImageNet's weights: those of one are shown.
-            told = [[r["sums"] for r in b["records"] if r["source"] in ("majority", "mean")] for _, b in found]
+            told = [{r["source"]: r["sums"] for r in b["records"] if r["modality"] == "none"} for _, b in found]
             if any(sums != told[0] for sums in told):
                 names = " and ".join(name for name, _ in found)
-                raise ValueError(f"{task}: the majority or mean differs between {names}, of the same rows")
+                wrong = min(k for sums in told for k in sums.keys() | told[0].keys() if sums.get(k) != told[0].get(k))
+                raise ValueError(f"{task}: the control {wrong} differs between {names}, of the same rows")
             shown = next((b for _, b in found if any(r["source"] == "imagenet" for r in b["records"])), found[0][1])
             for name, block in found:
                 mine = records_of(block, results[name]["encoder"])

@@ -22,6 +22,7 @@ import numpy as np
 
 from mvitac.bench.external.adapters import parse
 from mvitac.bench.suite import Suite, SuiteSet, SuiteTask, find_suite, outdated, pinned, shipped
+from mvitac.data.spec import MODALITIES
 from mvitac.evaluation import few_labels
 from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.leaks import declared_leak
@@ -159,10 +160,12 @@ def problems(value: dict[str, Any]) -> list[str]:
     if all("not_run" in block for block in value["blocks"]):
         found.append("was run on no task")
     data: dict[str, Any] = {}
+    scored = {r["modality"] for b in value["blocks"] for r in b.get("records", ()) if not r["source"]}
+    reads = {*encoder["parameters"], *(scored & {*MODALITIES}), *(MODALITIES if "both" in scored else ())}
     for block, (one, ask) in zip(value["blocks"], asked, strict=True):
         if "data" in block and data.setdefault(one.name, block["data"]) != block["data"]:
             found.append(f"{one.name}, {ask.name}: its data is not that of the set's other tasks")
-        found += [f"{one.name}, {ask.name}: {text}" for text in _excuses(block, encoder)]
+        found += [f"{one.name}, {ask.name}: {text}" for text in _excuses(block, reads)]
         if "not_run" not in block:
             found += [f"{one.name}, {ask.name}: {text}" for text in _of_block(block, suite, one, ask, encoder)]
     return found
@@ -180,7 +183,11 @@ def problems_of(encoder: dict[str, Any], controls: Sequence[str]) -> Iterator[st
     if why := wrong_name(encoder["name"], controls):
         yield f"the encoder {why}: give --name"
     seeds, weights = encoder["seeds"], encoder["weights"]
-    numbers = {"images_seen": encoder["images_seen"] or 0, "size": encoder["size"], **encoder["parameters"]}
+    numbers = {
+        "images_seen": 0 if encoder["images_seen"] is None else encoder["images_seen"],
+        "size": encoder["size"],
+        **encoder["parameters"],
+    }
     yield from (f"{key} is {number}" for key, number in numbers.items() if not 0 <= number < 1e18)
     texts = {key: encoder.get(key) for key in ("licence", "trained_on")}
     yield from (f"{key} is no text" for key, text in texts.items() if not isinstance(text, str | None))
@@ -188,9 +195,9 @@ def problems_of(encoder: dict[str, Any], controls: Sequence[str]) -> Iterator[st
         yield f"has {len(set(weights))} weights for seeds {seeds}"
 
 
-def _excuses(block: dict[str, Any], encoder: dict[str, Any]) -> set[str]:
-    """Reasons for a score that is not there, and that cannot be true."""
-    reads = {f"the encoder has no {modality}" for modality in encoder["parameters"]}
+def _excuses(block: dict[str, Any], reads: set[str]) -> set[str]:
+    """Reasons for a score that is not there, and that cannot be true, as the encoder ``reads`` these modalities."""
+    reads = {f"the encoder has no {modality}" for modality in reads}
     return {block.get("not_run", ""), *block.get("left_out", {}).values()} & reads
 
 
@@ -206,6 +213,8 @@ def _of_block(
         yield f"has {len(block['leaks'])} leak marks for {len(encoder['seeds'])} seeds"
     if "external" in encoder and {*block["leaks"]} != {declared_leak(encoder["trained_on"], one.names)}:
         yield f"its marks of leaks are not those of data trained on, {encoder['trained_on']}"
+    if not all(isinstance(text, str) for text in (*block["leaks"], block.get("group_by"), *block["groups"])):
+        yield "a leak mark, a group or what groups are is no text"
     if len({*block["groups"]}) < len(block["groups"]):
         yield "a group is there twice"
     if encoder["name"] in {record["source"] for record in records}:
@@ -252,7 +261,7 @@ def _impossible(record: dict[str, Any], num_groups: int) -> str:
     if {*record["sums"]} != {*names} or {*record} - {*KEY, "clipped", "targets", "sums"}:
         return f"its fields are {sorted(record)}, its sums {sorted(record['sums'])}"
     clipped, of = record.get("clipped", (0, 0))
-    if not 0 <= clipped <= of:
+    if not 0 <= clipped <= of < 1e9:
         return f"{clipped} of its {of} features were clipped"
     try:
         sums = {name: np.array(record["sums"][name], float) for name in names}

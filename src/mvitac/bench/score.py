@@ -159,7 +159,8 @@ def score_suite(entry: Entry, suite: Suite, root: Path | None, parts: Path, key:
             own = [Reader(model, opened, entry.name) for model in entry.models]
             readers = [Reader(model, opened, name) for name, model in beside]
             for ask, task in opened.tasks:
-                about = [suite.digest(), one.name, ask.name, opened.digests, here["versions"], here["commit"]]
+                about = [suite.digest(), one.name, ask.name, opened.digests, opened.beside]
+                about += [here["versions"], here["commit"]]
                 asked = suite, ask, task
                 controls = kept_part(parts, "controls", [*about, weights], partial(_controls, readers, opened, *asked))
                 scored = kept_part(parts, key, about, partial(_scores, own, *asked))

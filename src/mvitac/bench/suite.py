@@ -171,6 +171,15 @@ class Opened:
     tasks: tuple[tuple[SuiteTask, AnyTask], ...]  # what the suite asks, and the task as the data defines it
     digests: dict[str, str]  # of the data
 
+    @property
+    def beside(self) -> str:
+        """Digest of what scores and controls depend on, too, and ``digests`` have not: the data's controls, touches."""
+        pack = self.packs[0]
+        used = {
+            name: [pack.column(c).astype(str).tolist() for c in columns] for name, columns in pack.spec.controls.items()
+        }
+        return digest([used, pack.touch_groups.tolist()])
+
 
 def open_set(one: SuiteSet, root: Path | None) -> Opened | str:
     """Open the data of a set; the reason in one line if it is not there. ValueError if it is not that of the suite."""

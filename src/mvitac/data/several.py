@@ -7,6 +7,7 @@ other.
 import functools
 import itertools
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,9 @@ from mvitac.system.files import digest
 Columns = dict[str, pa.Array | pa.ChunkedArray]
 Tasks = Mapping[str, AnyTask]
 """Name of a task in a part -> the task of all parts."""
+
+
+SHARED = "is in train or val of part"  # and in test of another one: in a note of a mix
 
 
 class _Several(Pack):
@@ -134,7 +138,7 @@ def _shared_by_parts(parts: Mapping[str, Pack]) -> str:
         learned = one.rows("train", "val", "unlabelled")
         scored = np.flatnonzero(np.any([other.column(c) == "test" for c in other.spec.split_columns], axis=0))
         hashes = list(zip(("id", "group"), row_hashes(one), row_hashes(other), strict=True))
-        where = f"is in train or val of part {a} and in test of part {b}, one of"
+        where = f"{SHARED} {a} and in test of part {b}, one of"
         for column, ours, theirs in hashes[::-1]:
             both = scored[np.isin(theirs[scored], ours[learned])]
             if len(both):
@@ -149,7 +153,10 @@ def _mixed_tasks(parts: Mapping[str, Pack]) -> dict[str, Tasks]:
     """The tasks of each part. Those of one name that mean the same are one; others become <part>/<name>."""
     tasks = [task for pack in parts.values() for task in pack.spec.all_tasks]
     first = {task.name: task for task in reversed(tasks)}
-    shared = {name for name in first if len({_meaning(task) for task in tasks if task.name == name}) == 1}
+    targets = {target for task in tasks if isinstance(task, ValueTask) for target in task.targets}
+    units = Counter(target.name for target in targets)
+    two_units = {t.name for t in tasks if isinstance(t, ValueTask) and any(units[one.name] > 1 for one in t.targets)}
+    shared = {name for name in first if len({_meaning(task) for task in tasks if task.name == name}) == 1} - two_units
     return {
         part: {t.name: first[t.name] if t.name in shared else _of_part(part, t) for t in pack.spec.all_tasks}
         for part, pack in parts.items()
@@ -177,7 +184,7 @@ def _mixed_spec(parts: Mapping[str, Pack], tasks: Mapping[str, Tasks], notes: Se
     for part, spec in specs.items():
         for name, columns in spec.controls.items():
             alike = all(other.controls.get(name, columns) == columns for other in specs.values())
-            controls[name if alike else f"{part}/{name}"] = columns
+            controls[name if alike else f"{part}/{name}"] = tuple(map(_CONTROL.format, columns))
     return DataSpec(
         name=f"mix of {', '.join(specs)}",
         vision_channels=max(spec.vision_channels for spec in specs.values()),
@@ -193,6 +200,8 @@ def _mixed_spec(parts: Mapping[str, Pack], tasks: Mapping[str, Tasks], notes: Se
     )
 
 
+_CONTROL = "control/{}"
+"""A mix's column of a control, which in another part may be measured values."""
 OWN = re.compile(r"(id|group|touch_group|press|part|sensor|(has|crc|bytes|label)_.*)")
 """Columns that a mix does not take over as they are."""
 
@@ -222,7 +231,7 @@ def _mixed_columns(part: str, parts: Mapping[str, Pack], tasks: Tasks, mixed: Da
     numbers = [column for used in mixed.controls.values() for column in used]
     numbers += [target.name for task in mixed.values for target in task.targets]
     columns |= dict.fromkeys(numbers, pa.array(np.full(pack.num, np.nan)))
-    measured = {column: column for used in pack.spec.controls.values() for column in used}
+    measured = {_CONTROL.format(column): column for used in pack.spec.controls.values() for column in used}
     for task in pack.spec.values:
         own = tasks[task.name]
         assert isinstance(own, ValueTask)

@@ -70,7 +70,7 @@ class MixConfig(DatasetConfig):
 
 
 def open_packs(folders: Sequence[str]) -> Pack:
-    """The pack in one folder, or those in several (FOLDER or NAME=FOLDER) as one."""
+    """The pack in one folder, or those in several (FOLDER or NAME=FOLDER) as one; what they share is a note."""
     if not folders:
         raise ValueError("missing PACK: Folder of the pack, or of several")
-    return Pack(folders[0]) if len(folders) == 1 else MixConfig(parts=tuple(folders)).open()
+    return Pack(folders[0]) if len(folders) == 1 else MixConfig(parts=tuple(folders), allow_leak=True).open()

@@ -35,8 +35,8 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str
     """The jobs of ``plan``, whose data is ``pack``, ordered by seed and then by row.
 
     Rows that need what the data lacks (labels, a camera) and rows equal to an earlier one are left out. A row may read
-    the same samples differently (difference images of touch), but not other samples. ValueError if no row is possible,
-    or ``out`` holds other runs.
+    the same samples differently (difference images of touch; ``Work.other_images``), but not other samples. ValueError
+    if no row is possible, or ``out`` holds other runs.
     """
     assert plan.data is not None
     chosen(pack, session)
@@ -69,7 +69,12 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str
             if (job.out / "run.json").exists():
                 check_same(job.run, own, job.out)
             jobs.append(job)
-    return Work(plan, pack, jobs, left_out)
+    others = [row.label for row, own in possible if _images(own) != _images(pack)]
+    return Work(plan, pack, jobs, left_out, others)
+
+
+def _images(pack: Pack) -> dict[str, str]:
+    return {name: value for name, value in pack.digests.items() if not name.endswith("samples.parquet")}
 
 
 def _check_row(plan: Plan, row: Row, pack: Pack) -> tuple[Pack, str]:
@@ -79,8 +84,11 @@ def _check_row(plan: Plan, row: Row, pack: Pack) -> tuple[Pack, str]:
         raise ValueError(f"dataset {plan.data.name!r} has no {', '.join(missing)}")
     run = plan.run(row, plan.data, 0, pack.phased)
     own = pack if run.data == plan.data else run.data.open()
-    for name in ("id", "group", "split", *(f"label_{task.name}" for task in pack.spec.tasks)):
-        if name not in own.table.column_names or not np.array_equal(own.column(name), pack.column(name)):
+    answers = [f"label_{task.name}" for task in pack.spec.tasks]
+    values = [target.name for task in pack.spec.values for target in task.targets]
+    for name in ("id", "group", *pack.spec.split_columns, *answers, *values):
+        there = name in own.table.column_names
+        if not there or not np.array_equal(own.column(name), pack.column(name), equal_nan=name in values):
             raise ValueError(f"its data {own.path} has another column {name} than {pack.path}: give the same samples")
     run.check(own.spec, len(run.method.training_rows(own)), own.size)
     run.method.on_tiny_trunk(own.spec, run.encoder)
@@ -102,7 +110,10 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
         "data": work.pack.spec.name,
         "pack": work.pack.digest,
         "group_by": work.pack.spec.group_by,
-        "notes": [" ".join(note.split()) for note in work.pack.spec.notes],
+        "notes": [
+            *(" ".join(note.split()) for note in work.pack.spec.notes),
+            *(f"{label} reads other images than the controls" for label in work.other_images),
+        ],
         "leaks": "; ".join(work.pack.split_leaks(chosen(work.pack, session)[0]).values()),
         "records": [record for records, _ in scored for record in records] + controls,
         "retrieval": [record for _, retrieval in scored for record in retrieval] + found,

@@ -4,7 +4,7 @@ Jobs can be killed at any time and resume. A run whose loss became NaN or infini
 failed.json. A run that fails otherwise is reported, and the next call tries it again.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,10 @@ class Job:
     @property
     def done(self) -> bool:
         path = self.out / "scores.json"
-        return bool(self.failure) or (path.exists() and read_json(path, "a run's scores")["asked"] == self.asked)
+        if self.failure or not path.exists():
+            return bool(self.failure)
+        found = read_json(path, "a run's scores")  # which may have been copied from another run
+        return (found["asked"], found["of"]) == (self.asked, self.run.digest())
 
     def seconds(self) -> float:
         """Seconds of training."""
@@ -65,6 +68,7 @@ class Work:
     pack: Pack
     jobs: list[Job]
     left_out: dict[str, str]
+    other_images: list[str] = field(default_factory=list)  # labels of rows that read other images than ``pack``'s
 
 
 def do(job: Job, pack: Pack | None = None, *, quiet: bool = True) -> str:
@@ -79,7 +83,12 @@ def do(job: Job, pack: Pack | None = None, *, quiet: bool = True) -> str:
             write_json(job.out / "failed.json", {"error": str(error)}, sealed=True)
             return f"diverged: {error}"
         result = probe_runs([job.out], job.session, pack)
-        scores = {"asked": job.asked, "records": result["records"], "retrieval": result["retrieval"]}
+        scores = {
+            "asked": job.asked,
+            "of": job.run.digest(),
+            "records": result["records"],
+            "retrieval": result["retrieval"],
+        }
         write_json(job.out / "scores.json", scores, sealed=True)
         for name in (CHECKPOINT, PREVIOUS):  # a scored run needs none, and one is four times as large as the weights
             (job.out / name).unlink(missing_ok=True)

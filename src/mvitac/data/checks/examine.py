@@ -66,6 +66,7 @@ def examine(pack: Pack, *, part: bool = False) -> list[Finding]:
         *labels,
         *table_checks.ungrouped(pack),
         *table_checks.leaks(pack),
+        *table_checks.shared_by_parts(pack),
         table_checks.similar_names(pack),
         duplicates.exact_copies(pack, looks),
         duplicates.near_copies(pack, looks),

@@ -8,6 +8,7 @@ import numpy as np
 
 from mvitac.data.checks.finding import Finding, judged, share
 from mvitac.data.pack import Pack
+from mvitac.data.several import SHARED
 from mvitac.data.spec import UNGROUPED, listed
 
 KEYS = ("object", "instance", "recording", "video", "grasp", "experiment", "session", "sequence")
@@ -78,11 +79,11 @@ def leaks(pack: Pack) -> list[Finding]:
     for split in pack.spec.split_columns:
         own = [pack.answered(task) for task in pack.spec.all_tasks if task.split == split != "split"]
         counted = np.flatnonzero(np.logical_or.reduce(own)) if own else np.arange(pack.num)
-        sides = sides_of(pack.column(split).astype(str)[counted])
         notes: dict[str, str] = {}
         rows = []
         for name in names:
-            values = pack.column(name).astype(str)[counted]
+            there = counted[pack.table.column(name).is_valid().to_numpy()[counted]]  # a part of a mix may lack it
+            values, sides = pack.column(name).astype(str)[there], sides_of(pack.column(split).astype(str)[there])
             on = {side: set(values[sides == side].tolist()) for side in np.unique(sides)}
             both = sorted({v for a in on for b in on if a < b for v in on[a] & on[b]})
             if both:
@@ -93,7 +94,7 @@ def leaks(pack: Pack) -> list[Finding]:
                 notes[name] = f"{name}{kind}: {num} in more than one split, e.g. {both[0]!r}{of}"
                 for one in both[:4]:  # a row of each split, side by side on the sheet
                     mine = np.flatnonzero(values == one)
-                    rows += [int(counted[mine[sides[mine] == side][0]]) for side in np.unique(sides[mine])]
+                    rows += [int(there[mine[sides[mine] == side][0]]) for side in np.unique(sides[mine])]
         item = "groups across splits" if split == "split" else f"groups across column {split}"
         evidence = "; ".join(notes.values()) or f"none of {', '.join(names)} is in more than one split"
         advice = "split by the largest of these keys, or report what test shares with train"
@@ -106,6 +107,13 @@ def ungrouped(pack: Pack) -> list[Finding]:
     """Repeat the note of a table that was packed without groups; [] with groups."""
     notes = [note for note in pack.spec.notes if UNGROUPED in note]
     return [judged("groups", "; ".join(notes), "pack again with --group COLUMN")] if notes else []
+
+
+def shared_by_parts(pack: Pack) -> list[Finding]:
+    """Repeat the note of a mix on what train of one part and test of another have in common; [] if nothing."""
+    notes = [note for note in pack.spec.notes if SHARED in note]
+    advice = "pack them with splits that agree, or leave a part out"
+    return [judged("shared by parts", "; ".join(notes), advice, broken=True)] if notes else []
 
 
 def _predicts(what: str, task: str, values: np.ndarray, labels: np.ndarray) -> list[str]:
