@@ -119,6 +119,18 @@ def test_each_replacement_gives_what_it_says(pack: Pack) -> None:
     assert felt["noise"].std() < force.std() / 5 and np.abs(felt["noise"].mean() - force.mean()) < 15  # it is cut at 0
 
 
+def test_a_policy_may_change_its_images_in_place() -> None:
+    """What replaces them stays as it was."""
+    episodes = suite_episodes(replace(find_suite("insert-v1"), episodes=3), ("touch", "30"))
+
+    def inverted(o: dict[str, Any]) -> np.ndarray:
+        np.subtract(255, o["touch"], out=o["touch"])
+        return np.array([o["touch"].mean() / 100, 0.0])
+
+    clean = ablate(lambda o: [(255 - o["touch"]).mean() / 100, 0.0], replace(episodes))
+    assert ablate(inverted, episodes)["rows"] == clean["rows"]
+
+
 def test_numbers_that_would_be_wrong(pack: Pack) -> None:
     """Values named as a sense never hide a replacement; a component that never changes counts as 0, whatever is given."""
     episodes = read_episodes(pack)

@@ -98,8 +98,14 @@ def test_gymnasium_environment() -> None:
 
     import mvitac.control.env
 
-    env = gymnasium.make("mvitac/Insert-v1").unwrapped
-    check_env(env, skip_render_check=True)
+    env = gymnasium.make("mvitac/Insert-v1", render_mode="rgb_array").unwrapped
+    check_env(env)
+    for action in (0.0, [0.0], [0.0, np.nan], [0.0] * 3):
+        with pytest.raises(ValueError, match="give 2 numbers, each from -1 to 1"):
+            env.step(action)
+    for wrong in ({"task": "corner"}, {"condition": "x"}):
+        with pytest.raises(ValueError, match="unknown task and condition of insert-v1"):
+            gymnasium.make("mvitac/Insert-v1", **wrong)
     seen, info = env.reset(seed=1)
     over, total = False, 0.0
     while not over:

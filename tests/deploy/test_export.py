@@ -97,6 +97,13 @@ def test_the_resize_in_the_graph_is_the_probes_pixel_by_pixel(stored: int, model
     torch.testing.assert_close(found, plain_view(images, 32), atol=1e-4, rtol=0)
 
 
+def test_an_unknown_runtime_is_refused(onnx: Path) -> None:
+    wrong: Any = {"engine": "torchscript"}
+    for given in (wrong, {"threads": -1}):
+        with pytest.raises(ValueError, match="give one of auto, onnxruntime, openvino, and 0 or more"):
+            Engine(onnx, **given)
+
+
 @pytest.mark.parametrize("name", ["onnxruntime", "openvino"])
 def test_an_export_is_the_trained_model(name: Any, model: Model, onnx: Path, pack: Pack) -> None:
     """Whatever the batch and the engine, and with embed() and predict() on the other side."""

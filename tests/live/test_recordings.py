@@ -17,7 +17,7 @@ from mvitac.datasets.folder import FolderConfig
 from mvitac.deploy.engine import Engine
 from mvitac.live.cameras import Recording, recording
 from mvitac.live.contact import LiveConfig
-from mvitac.live.recordings import Recordings, pack_tables
+from mvitac.live.recordings import Recordings, answers, pack_tables
 from support.videos import write_video
 
 NUM, FREE = 50, 20
@@ -77,15 +77,29 @@ def test_every_frame_is_answered_as_the_engine_answers_it(engine: Engine, films:
 
 
 def test_damaged_frames_are_left_out(engine: Engine, films: dict[str, Path], tmp_path: Path) -> None:
+    """And named; 2.png comes before 10.png, as in a pack."""
     for number in range(NUM):
         image = np.full((32, 32, 3), 100 if number < FREE else 160, np.uint8)
-        Image.fromarray(image).save(tmp_path / f"{number:02d}.png")
-    (tmp_path / "03.png").write_bytes(b"damaged")
+        Image.fromarray(image).save(tmp_path / f"{number}.png")
+    (tmp_path / "3.png").write_bytes(b"damaged")
     files = opened(films) | {"touch": [recording(f"{tmp_path}@25")]}
     hurt = Recordings(engine, files, FIRST)
     table = whole(hurt.tables())
     assert table["frame"].tolist() == [i for i in range(NUM) if i != 3] and hurt.left_out == 1
-    assert table["time"][3] == pytest.approx(4 / 25)
+    assert table["time"][3] == pytest.approx(4 / 25) and table["contact"].sum() == NUM - FREE
+    ((text, first),) = hurt.told.items()
+    assert "3.png" in text and first == 3
+
+
+def test_names_of_ours_and_of_others_are_not_taken(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine, "classes", {"contact": ["edge", "confidence"]})
+    target = {"name": "force", "unit": "N", "edges": [], "spread": [0.5]}
+    monkeypatch.setattr(engine, "values", {"a": [target], "b": [target]})
+    found = answers(engine, {"probability_contact": np.eye(2), "value_a": np.ones((2, 1)), "value_b": np.zeros((2, 1))})
+    assert [*found] == [
+        *("contact (label)", "contact.confidence", "contact.edge", "contact.confidence (class)"),
+        *("force [N]", "force.spread [N]", "force [N] (b)", "force.spread [N] (b)"),
+    ]
 
 
 def test_a_model_of_difference_images_needs_the_free_sensor(
@@ -159,12 +173,14 @@ def test_predict_command(
     (tmp_path / "gel.csv").write_text("touch\ntouch.png\n")
     assert main([*command, str(tmp_path / "gel.csv"), "--out", str(out)]) == 2
     assert "has no vision, which the model takes too" in capsys.readouterr().err
+    (empty := tmp_path / "empty").mkdir()
     wrong = {
         (): "give one SOURCE",
         (str(films["touch"]), *both): "give one SOURCE",
         (str(films["touch"]),): "takes vision and touch",
         tuple(both[2:]): "the model takes {'vision': 1, 'touch': 1}",
         ("--vision", "0", *both[2:]): "give a video",
+        (str(empty),): "holds no pictures",
     }
     for words, says in wrong.items():
         assert main([*command, *words, "--out", str(out)]) == 2
@@ -186,4 +202,13 @@ def test_a_crop_is_what_the_model_sees(engine: Engine, films: dict[str, Path], t
     assert all(np.array_equal(values, tables[1][name]) for name, values in tables[0].items())
     assert tables[0]["contact"].sum() == NUM - FREE
     large = Recordings(engine, {**opened(films), "touch": [recording(f"{films['touch']}#100:0:80:60")]}, free=free[:0])
-    assert not list(large.tables())
+    assert not list(large.tables()) and "crop 100:0:80:60 reaches beyond 160 x 120" in next(iter(large.told))
+
+
+def test_images_that_change_in_size_are_told(engine: Engine, films: dict[str, Path], tmp_path: Path) -> None:
+    for number in range(NUM):
+        Image.fromarray(np.full((32 + 8 * (number > 30),) * 2 + (3,), 100, np.uint8)).save(tmp_path / f"{number}.png")
+    changed = Recordings(engine, opened(films) | {"touch": [recording(f"{tmp_path}@25")]}, FIRST)
+    assert whole(changed.tables())["frame"].tolist() == [*range(NUM)]
+    ((text, first),) = changed.told.items()
+    assert text.startswith("touch 0 changed from 32x32 to 40x40") and first == 31

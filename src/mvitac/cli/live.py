@@ -180,7 +180,11 @@ def predict(argv: list[str]) -> None:
     opened = dict.fromkeys(engine.inputs, single) if single else opened
     _say_uncropped(engine, dict.fromkeys(engine.inputs, (options.source,)) if single else given)
     recordings = Recordings(engine, opened, options.live, options.free())
-    _write(options.out, recordings.tables(), recordings.num)
+    try:
+        _write(options.out, recordings.tables(), recordings.num)
+    finally:  # also where no frame is left
+        for text, first in [*recordings.told.items()][:9]:
+            _say(f"from frame {first}: {text}")
     if num := recordings.left_out:
         _say(f"{num} frames are left out: damaged, or without a frame of the other recording within {TOGETHER} s")
     if "touch" in opened and not recordings.calibrated:

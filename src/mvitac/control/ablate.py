@@ -12,6 +12,7 @@ Changes are in standard deviations of the action, the mean over its components; 
 recorded episodes is the distance to the demonstrated action, in the same unit; in those of a suite what an episode lost.
 """
 
+import copy
 import runpy
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -224,7 +225,8 @@ def act(
 def _action(policy: Policy, given: dict[str, Any], number: int) -> np.ndarray:
     """What ``policy`` answers [T]; ValueError if that is not finite numbers, or it raises anything."""
     place = f"in step {given['step']} of episode {number + 1}"
-    action = _given(lambda: np.asarray(policy(given), float).ravel(), place)
+    own = copy.deepcopy(given)  # which it may change in place
+    action = _given(lambda: np.asarray(policy(own), float).ravel(), place)
     if not np.isfinite(action).all():
         raise ValueError(f"the policy gives {action} {place}")
     return action

@@ -12,6 +12,8 @@ import numpy as np
 from gymnasium import spaces
 
 from mvitac.control.result import find_suite
+from mvitac.control.suite import OWN
+from mvitac.registry import unknown
 
 
 class LoopEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
@@ -23,10 +25,11 @@ class LoopEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 - gymnasium's name and type
-    render_mode = "rgb_array"
 
-    def __init__(self, suite: str, task: str, condition: str) -> None:
-        self.suite, self.cell = find_suite(suite), (task, condition)
+    def __init__(self, suite: str, task: str, condition: str, render_mode: str | None = "rgb_array") -> None:
+        self.suite, self.cell, self.render_mode = find_suite(suite), (task, condition), render_mode
+        if self.cell not in (cells := self.suite.cells(OWN)):
+            raise unknown(f"task and condition of {suite}", "/".join(self.cell), map("/".join, cells))
         self.world: Any = self.suite.world(*self.cell, 0)
         images: Any = {sense: spaces.Box(0, 255, self.world.look(sense).shape, np.uint8) for sense in self.world.senses}
         self.observation_space: Any = spaces.Dict(images)
@@ -39,7 +42,10 @@ class LoopEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         return self._seen(), self._info()
 
     def step(self, action: np.ndarray) -> Any:
-        before = self.world.loss
+        """ValueError if ``action`` is of another shape, or no number."""
+        action, before = np.asarray(action, float), self.world.loss
+        if action.shape != self.action_space.shape or np.isnan(action).any():
+            raise ValueError(f"action {action}: give {self.action_space.shape[0]} numbers, each from -1 to 1")
         self.world.step(self.world.most * np.clip(action, -1, 1))
         return self._seen(), float(before - self.world.loss), self.world.over, False, self._info()
 

@@ -26,10 +26,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from mvitac.data.stamps import number_of
 from mvitac.data.video import frame_times
 from mvitac.datasets.table.clocks import nearest
 from mvitac.datasets.table.image_refs import Frame, ImageRef
-from mvitac.datasets.table.manifest import Manifest, Row, number_of
+from mvitac.datasets.table.manifest import Manifest, Row
 from mvitac.datasets.table.parquet import Refs, add_file
 from mvitac.datasets.table.table import RecordedConfig
 from mvitac.registry import unknown

@@ -9,9 +9,9 @@ from typing import ClassVar, Literal
 from mvitac.data.pack import Pack
 from mvitac.data.several import MixedPack
 from mvitac.data.spec import check_request
+from mvitac.data.stamps import number_of
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import PackConfig
-from mvitac.datasets.table.manifest import number_of
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from mvitac.data.images import IMAGES, decode
+from mvitac.data.stamps import in_order
 from mvitac.data.video import VIDEOS, frames
 from mvitac.sim.sensors import SENSORS
 from mvitac.system.files import brief
@@ -141,13 +142,15 @@ class Video(Recording):
 
 
 class Folder(Recording):
-    """The pictures of a folder in name order."""
+    """The pictures of a folder, in the order in which ``mvitac data pack`` reads them."""
 
     def __init__(self, path: Path, fps: float = 30.0) -> None:
         self.path, self.fps = path, fps
 
     def open(self) -> None:
-        self.files = sorted(p for p in self.path.iterdir() if p.suffix.lower() in IMAGES)
+        files = sorted(p for p in self.path.iterdir() if p.suffix.lower() in IMAGES)
+        place = {name: number for number, name in enumerate(in_order({file.stem for file in files}))}
+        self.files = sorted(files, key=lambda file: place[file.stem])
         if not self.files:
             raise OSError(f"{self.path} holds no pictures ({', '.join(IMAGES)})")
         self.times, self.number = np.arange(len(self.files)) / self.fps, -1
@@ -239,10 +242,14 @@ def _place(text: str) -> tuple[Path, float]:
 
 
 def is_recording(text: str) -> bool:
-    """Whether ``text`` names a video, or a folder[@fps] with images in it."""
+    """Whether ``text`` names a video, or a folder[@fps] with images or nothing in it."""
     path, _ = _place(crop_of(text)[0])
-    images = path.is_dir() and any(file.suffix.lower() in IMAGES for file in path.iterdir())
-    return images or path.suffix.lower() in VIDEOS
+    files = [*path.iterdir()] if path.is_dir() else [path]
+    return (
+        not files
+        or any(file.suffix.lower() in IMAGES for file in files if path.is_dir())
+        or path.suffix.lower() in VIDEOS
+    )
 
 
 def recording(text: str) -> Recording:

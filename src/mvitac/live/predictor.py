@@ -10,7 +10,7 @@ Shapes: frames uint8 RGB [H, W, 3].
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,8 +21,15 @@ from mvitac.deploy.engine import Engine, frame_shapes, frames_of, spread_at
 from mvitac.live.contact import Contact, LiveConfig
 from mvitac.live.streams import Event, Frame, Stream
 
+OURS = {"frame", "time", "contact", "touch", "id", "group", "split", "age_ms"}
+"""Fields of predictions that tasks may not take."""
 NUM_AGES = 10_000
 """Number of latest predictions, some minutes of them, over which the percentiles of the age are computed."""
+
+
+def own_name(name: str, kind: str, taken: Iterable[str] = ()) -> str:
+    """``name`` of a task, class or value in predictions; with its ``kind`` where a field of ours or another is called so."""
+    return f"{name} ({kind})" if name in OURS or name in taken else name
 
 
 @dataclass
@@ -248,10 +255,12 @@ class Live:
             return said
         said["age_ms"] = 1000 * self.ages[-1]
         for task, (name, confidence) in self.answers(self.answer).items():
-            said[task] = {"class": name, "confidence": confidence}
+            said[own_name(task, "label", said)] = {"class": name, "confidence": confidence}
         for task, targets in self.engine.values.items():
             found = zip(targets, self.answer.values[task].tolist(), strict=True)
-            said[task] = {t["name"]: {"value": v, "unit": t["unit"], "spread": spread_at(t, v)} for t, v in found}
+            said[own_name(task, "value", said)] = {
+                t["name"]: {"value": v, "unit": t["unit"], "spread": spread_at(t, v)} for t, v in found
+            }
         return said
 
     def summary(self) -> dict[str, Any]:

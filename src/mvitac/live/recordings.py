@@ -6,7 +6,6 @@ far), if the sensor was seen without contact; of a pack ``id``, ``group`` and ``
 """
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from itertools import islice
 from typing import Any
 
@@ -18,9 +17,10 @@ from mvitac.data.windows import windowed
 from mvitac.deploy.engine import Engine, spread_at
 from mvitac.live.cameras import Recording
 from mvitac.live.contact import LiveConfig
-from mvitac.live.predictor import Live
-from mvitac.live.streams import Stream
+from mvitac.live.predictor import Live, own_name
+from mvitac.live.streams import Event, Stream
 from mvitac.registry import from_json
+from mvitac.system.files import brief
 from mvitac.system.prefetch import prefetch
 
 BATCH = 32
@@ -33,17 +33,24 @@ def answers(engine: Engine, outputs: dict[str, np.ndarray]) -> Table:
 
     Of classes: ``TASK``, ``TASK.confidence`` and ``TASK.CLASS``, its probability. Of values: ``TARGET [UNIT]`` and
     ``TARGET.spread [UNIT]``, the usual error of test rows in the same range; ``TASK.TARGET`` where a task has several.
+    A name that is taken (``own_name``) is followed by what it is, in brackets.
     """
     table: Table = {}
+
+    def put(name: str, kind: str, column: Any) -> None:
+        table[own_name(name, kind, table)] = column
+
     for task, classes in engine.classes.items():
         p = outputs[f"probability_{task}"]
-        table |= {task: np.array(classes)[p.argmax(1)], f"{task}.confidence": p.max(1)}
-        table |= {f"{task}.{name}": p[:, k] for k, name in enumerate(classes)}
+        put(task, "label", np.array(classes)[p.argmax(1)])
+        put(f"{task}.confidence", "label", p.max(1))
+        for k, name in enumerate(classes):
+            put(f"{task}.{name}", "class", p[:, k])
     for task, targets in engine.values.items():
         for target, found in zip(targets, outputs[f"value_{task}"].T, strict=True):
             name, unit = target["name"] if len(targets) == 1 else f"{task}.{target['name']}", target["unit"]
-            table[f"{name} [{unit}]"] = found
-            table[f"{name}.spread [{unit}]"] = [spread_at(target, value) for value in found.tolist()]
+            put(f"{name} [{unit}]", task, found)
+            put(f"{name}.spread [{unit}]", task, [spread_at(target, value) for value in found.tolist()])
     return table
 
 
@@ -70,6 +77,7 @@ class Recordings:
     Attributes:
         num: Frames of the first touch sensor, or of the camera where there is none.
         left_out: Of these, how many were damaged, or more than ``TOGETHER`` away from those of another recording.
+        told: What was wrong with frames -> number of the first one.
         calibrated: Whether every touch sensor was seen without contact.
     """
 
@@ -85,12 +93,12 @@ class Recordings:
         Raises:
             ValueError: The engine takes others, or needs the sensor without contact, which is nowhere to be seen.
         """
-        self.engine, self.left_out = engine, 0
+        self.engine, self.left_out, self.told = engine, 0, dict[str, int]()
         streams: Any = {
             m: [Stream(f"{m} {i}", file, clock=lambda file=file: file.time) for i, file in enumerate(several)]
             for m, several in files.items()
         }
-        self.live = Live(engine, streams, config, free=free, always=True)
+        self.live = Live(engine, streams, config, free=free, always=True, tell=self._tell)
         self.pairs: list[tuple[Any, Recording]] = [(s, s.origin) for several in streams.values() for s in several]
         self.leading: Any = self.live.leading.origin
         self.calibrated = all(self._calibrate(stream.name, stream.origin) for stream in streams.get("touch", ()))
@@ -99,12 +107,25 @@ class Recordings:
             raise ValueError(f"no {num} frames show the sensor without contact, as the model needs: give --background")
         self.num = len(self.leading.times)
 
+    def _tell(self, event: Event) -> None:
+        if event.what == "resolution changed":
+            text = f"{event.text}: contact is learned again from there, as if nothing were touched"
+            self.told.setdefault(text, self.leading.number)
+
+    def _take(self, name: str, file: Recording) -> np.ndarray | None:
+        """The next frame; None if it is damaged, which is noted."""
+        try:
+            return file.cropped(file.read())
+        except ValueError as error:
+            self.told.setdefault(f"{name}: {brief(error)}", file.number)
+        return None
+
     def _calibrate(self, name: str, file: Recording) -> bool:
         """Learn the background of a touch sensor from its first frames, or the first without contact."""
         contact = self.live.contacts[name]
         while contact.background is None and file.number + 1 < len(file.times):
-            with suppress(ValueError):  # a damaged frame
-                contact(file.cropped(file.read()))
+            if (image := self._take(name, file)) is not None:
+                contact(image)
         file.open()
         return contact.background is not None
 
@@ -124,8 +145,8 @@ class Recordings:
         for number, time in enumerate(self.leading.times.tolist()):
             for stream, file in self.pairs:
                 while file.number < 0 or (file.number < number if file is self.leading else _nearer(file, time)):
-                    with suppress(ValueError):  # a damaged frame
-                        stream.take(file.cropped(file.read()))
+                    if (image := self._take(stream.name, file)) is not None:
+                        stream.take(image)
             newest = {m: [stream.newest() for stream in several] for m, several in self.live.streams.items()}
             apart = [abs(f.time - time) if f else np.inf for several in newest.values() for f in several]
             found, given = self.live.leading.newest(), None

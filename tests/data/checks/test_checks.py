@@ -358,6 +358,27 @@ def test_other_keys_are_looked_at_too(tmp_path: Path) -> None:
     assert "4 of 4 in test are also in train" in own.evidence
 
 
+def test_what_two_packs_share_is_a_finding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Here images, under other names. A key that one of them lacks is none of its rows'."""
+
+    def renamed(_: Sample, item: int) -> dict[str, Any]:
+        names = dict.fromkeys(("group", "touch_group", "object"), f"new {item // NUM_FRAMES}")
+        return {**names, "id": f"new {item}", "split": "test" if item < NUM_FRAMES else "train"}
+
+    for name, source in {"one": Presses(), "other": altered(Presses(), renamed, name="other")}.items():
+        build(source, tmp_path / name, size=SIDE, quiet=True)
+    both = str(tmp_path / "one"), str(tmp_path / "other")
+    assert main(["data", "check", *both, "--json", str(tmp_path / "found.json")]) == 2
+    found = {f["item"]: f for f in json.loads((tmp_path / "found.json").read_text())["findings"]}
+    shared = found["shared by parts"]
+    assert (
+        shared["verdict"] == "broken"
+        and "is in train or val of part one and in test of part other" in shared["evidence"]
+    )
+    assert found["groups across splits"]["verdict"] == "ok"
+    assert main(["data", "info", *both]) == 0 and "is in train or val of part one" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("objects", ["the same", "others", "the same, of two sensors"])
 def test_resized_copies_in_another_pack_are_found(tmp_path: Path, objects: str) -> None:
     """What training on one pack and scoring on the other would not call a leak. The other names no sensors."""

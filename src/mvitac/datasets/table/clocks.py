@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from mvitac.data.stamps import STAMPS, seconds
+from mvitac.data.stamps import STAMPS, number_of, seconds
 from mvitac.data.video import frame_times
 from mvitac.datasets.table.columns import with_elements
 from mvitac.datasets.table.image_refs import Frame, ImageRef
-from mvitac.datasets.table.manifest import READERS, Manifest, Row, number_of, read_manifest, text_of
+from mvitac.datasets.table.manifest import READERS, Manifest, Row, read_manifest, text_of
 from mvitac.system.files import digest
 
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from mvitac.data.checks.table_checks import KEYS
 from mvitac.data.pack_table import SPLITS
 from mvitac.data.spec import UNGROUPED, Target, Task, ValueTask, listed
-from mvitac.datasets.table.manifest import Manifest, Row, normal, number_of, text_of
+from mvitac.data.stamps import number_of
+from mvitac.datasets.table.manifest import Manifest, Row, normal, text_of
 
 COMPARE: dict[str, Callable[[float, float], bool]] = {"<=": operator.le, ">=": operator.ge}
 

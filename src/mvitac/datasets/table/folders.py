@@ -3,7 +3,6 @@
 Frames have the columns recording (their group), frame and, where it is known, time in seconds and minute.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +11,11 @@ import numpy as np
 
 from mvitac.data.images import IMAGES
 from mvitac.data.pack_table import SPLITS
-from mvitac.data.stamps import seconds
+from mvitac.data.stamps import in_order, number_of, seconds
 from mvitac.data.video import VIDEOS
 from mvitac.datasets.table.clocks import nearest, times_of
 from mvitac.datasets.table.image_refs import Frame, ImageRef
-from mvitac.datasets.table.manifest import Manifest, Row, number_of
+from mvitac.datasets.table.manifest import Manifest, Row
 from mvitac.system.files import digest
 
 CAMERAS = ("touch", "left", "right", "vision")
@@ -56,10 +55,8 @@ def _split_rows(root: Path, split: str, plain: str, every: int) -> list[Row]:
     if flat and len(flat) < len(keys):
         raise ValueError(f"{base}: {flat[0]}.* is not in a class folder: put it in one, named by its class")
     numbered = bool(flat) and all(number_of(key) is not None for key in flat)
-    if flat:  # 2 comes before 10, and 2.25 before 2.5
-        keys.sort(
-            key=float if numbered else lambda key: [int(n) if n.isdecimal() else n for n in re.split(r"(\d+)", key)]
-        )
+    if flat:
+        keys = in_order(flat)
     times = seconds(keys, base) if numbered else np.zeros(1)
     stamped = times.min() > 1e9  # since 1970; smaller numbers count the images
     rows = []

@@ -165,15 +165,6 @@ def normal(text: str) -> str:
     return " ".join(unicodedata.normalize("NFC", text).split())
 
 
-def number_of(text: str) -> float | None:
-    """Return ``text`` as a finite number, or None. 1_2 is not a number here, although Python accepts it."""
-    try:
-        value = float("" if "_" in text else text)
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
-
-
 def in_clone(path: Path, inside: str, pattern: str, url: str) -> Path:
     """Return folder ``inside`` of a clone of ``url`` at ``path``, or ``path`` itself; it must contain ``pattern``."""
     for root in (path / inside, path):

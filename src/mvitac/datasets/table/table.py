@@ -18,12 +18,13 @@ import tyro
 from mvitac.data.pack_table import SPLITS
 from mvitac.data.source import Lost, Sample, Source, one_stamp
 from mvitac.data.spec import AnyTask, DataSpec
+from mvitac.data.stamps import number_of
 from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.datasets.table import clocks, columns, images, splits
 from mvitac.datasets.table.columns import Condition, all_hold, value_task
 from mvitac.datasets.table.image_refs import span_of
 from mvitac.datasets.table.images import Background, Row, bundles, read_rows
-from mvitac.datasets.table.manifest import Manifest, number_of
+from mvitac.datasets.table.manifest import Manifest
 from mvitac.datasets.table.splits import BY_GROUP
 from mvitac.registry import check_range, to_json, unknown
 from mvitac.system.files import parse_json
