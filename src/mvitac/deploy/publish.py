@@ -15,7 +15,7 @@ from mvitac.datasets.simulated import SimulatedConfig
 from mvitac.deploy.artifact import preprocessing, read
 from mvitac.deploy.card import card
 from mvitac.evaluation.controls import Records, controls_of
-from mvitac.evaluation.evaluate import as_trained, check_unseen, stored_result
+from mvitac.evaluation.evaluate import as_trained, check_unseen, noted, stored_result
 from mvitac.evaluation.leaks import FILE, Scored, Source, mark_split_leaks
 from mvitac.evaluation.probe import FittedProbes, probe_model, scorable, split_rows
 from mvitac.evaluation.regressors import Linear
@@ -162,7 +162,10 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
         for weight in (w for w in model.state_dict().values() if half and w.ndim > 1):
             weight.copy_(weight.half())
         _, record = load_run(run)
-        pack = as_trained(model, pack) if pack else own_data(model, "fit the probes on a pack, --on PACK")
+        if pack:
+            pack = as_trained(model, pack)
+        else:
+            pack = noted(own_data(model, "fit the probes on a pack, --on PACK"), [run])
         learned, scores = _fit_and_score(run, model, pack, allow_leak)
         met = sensors_of(pack, pack.rows("train", "val", "unlabelled"))  # by the probes, if not by the encoders
         model.spec = replace(model.spec, sensors=tuple(sorted({*model.spec.sensors, *met})))

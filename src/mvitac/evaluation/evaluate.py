@@ -202,10 +202,15 @@ def _common_pack(paths: Sequence[Path], models: Sequence[Model], pack: Pack | No
     packs = [model.open_data() for model in models]
     if len({p.digest for p in packs}) > 1:
         raise ValueError("these runs were trained on different data: probe them one by one, or on one pack with --on")
-    found, own = copy(packs[0]), {_trained_on(path) for path in paths}
-    if own - {None, found.digest}:
-        found.spec = replace(found.spec, notes=(*found.spec.notes, "the data of these runs changed since training"))
-    return found
+    return noted(packs[0], paths)
+
+
+def noted(pack: Pack, paths: Sequence[Path]) -> Pack:
+    """The data that the runs at ``paths`` name; with a note if it is not what they were trained on."""
+    if {_trained_on(path) for path in paths} - {None, pack.digest}:
+        pack = copy(pack)
+        pack.spec = replace(pack.spec, notes=(*pack.spec.notes, "the data of these runs changed since training"))
+    return pack
 
 
 def _unlearned(pack: Pack, tasks: Sequence[AnyTask]) -> list[str]:
