@@ -13,6 +13,7 @@ from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders
 from mvitac.nn.initial import Init
+from mvitac.nn.vit import check_vit
 from mvitac.registry import check_range, from_json, to_json
 from mvitac.system.files import digest, read_json
 from mvitac.transforms.random_views import Augment, ViewAugment
@@ -169,7 +170,8 @@ class Run:
                 raise ValueError(
                     f"{modality} is locked at random weights: give --encoder.{modality}.weights, or --init"
                 )
-            self.method.check_encoder(encoder, size)
+            if self.method.needs_vit:
+                check_vit(encoder, self.method.name, size)
         if self.precision == "bf16" and self.device.startswith("mps"):
             raise ValueError("bf16 is not supported on mps: use --precision fp32")
 
@@ -196,7 +198,9 @@ class Run:
         value = to_json(replace(self, init=replace(init, path=None)))
         for name in NOT_IN_DIGEST:
             del value[name]
-        for name in self.data.without_effect:
+        # Options that do not change the outcome: local ones, and how raw pixels would be compressed.
+        idle = (*self.data.local, "store", "quality") if self.data.store == "raw" else self.data.local
+        for name in idle:
             del value["data"][name]
         return digest(value)
 

@@ -162,10 +162,12 @@ def problems(value: dict[str, Any]) -> list[str]:
     data: dict[str, Any] = {}
     scored = {r["modality"] for b in value["blocks"] for r in b.get("records", ()) if not r["source"]}
     reads = {*encoder["parameters"], *(scored & {*MODALITIES}), *(MODALITIES if "both" in scored else ())}
+    untrue = {f"the encoder has no {modality}" for modality in reads}  # no reason for a score that is not there
     for block, (one, ask) in zip(value["blocks"], asked, strict=True):
         if "data" in block and data.setdefault(one.name, block["data"]) != block["data"]:
             found.append(f"{one.name}, {ask.name}: its data is not that of the set's other tasks")
-        found += [f"{one.name}, {ask.name}: {text}" for text in _excuses(block, reads)]
+        given = {block.get("not_run", ""), *block.get("left_out", {}).values()}
+        found += [f"{one.name}, {ask.name}: {text}" for text in given & untrue]
         if "not_run" not in block:
             found += [f"{one.name}, {ask.name}: {text}" for text in _of_block(block, suite, one, ask, encoder)]
     return found
@@ -183,22 +185,13 @@ def problems_of(encoder: dict[str, Any], controls: Sequence[str]) -> Iterator[st
     if why := wrong_name(encoder["name"], controls):
         yield f"the encoder {why}: give --name"
     seeds, weights = encoder["seeds"], encoder["weights"]
-    numbers = {
-        "images_seen": 0 if encoder["images_seen"] is None else encoder["images_seen"],
-        "size": encoder["size"],
-        **encoder["parameters"],
-    }
+    seen = 0 if encoder["images_seen"] is None else encoder["images_seen"]
+    numbers = {"images_seen": seen, "size": encoder["size"], **encoder["parameters"]}
     yield from (f"{key} is {number}" for key, number in numbers.items() if not 0 <= number < 1e18)
     texts = {key: encoder.get(key) for key in ("licence", "trained_on")}
     yield from (f"{key} is no text" for key, text in texts.items() if not isinstance(text, str | None))
     if not len(seeds) == len(set(seeds)) == len(set(weights)) == len(weights):
         yield f"has {len(set(weights))} weights for seeds {seeds}"
-
-
-def _excuses(block: dict[str, Any], reads: set[str]) -> set[str]:
-    """Reasons for a score that is not there, and that cannot be true, as the encoder ``reads`` these modalities."""
-    reads = {f"the encoder has no {modality}" for modality in reads}
-    return {block.get("not_run", ""), *block.get("left_out", {}).values()} & reads
 
 
 def _of_block(

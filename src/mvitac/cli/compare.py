@@ -12,7 +12,7 @@ from mvitac.evaluation.probe_config import Probe
 from mvitac.experiments.collect import outline
 from mvitac.experiments.cross_validation import gather_folds, lay_out_folds, together
 from mvitac.experiments.jobs import do_all
-from mvitac.experiments.plan import PLANS, Plan, find_plan, setting
+from mvitac.experiments.plan import PLANS, find_plan, setting
 from mvitac.experiments.table_formats import write_tables
 from mvitac.recipes import RECIPES
 from mvitac.registry import check_known, to_json
@@ -77,10 +77,17 @@ def compare(argv: list[str]) -> None:
     """mvitac compare --plan table1|table2|ablation|FILE [--data D] [--recipe R] [--seeds N] [--dry-run]"""
     chosen, rest = selectors(argv, ("--plan", "--data", "--recipe"))
     plan = find_plan(chosen.get("--plan", "table1"))
-    options = _parse(chosen, rest, plan)
+    check_known("recipe", [recipe := chosen.get("--recipe", plan.recipe)], RECIPES)
+    data = dataset(chosen["--data"]) if "--data" in chosen else plan.data
+    data = data or dataset("grasps" if plan.name == "table2" else "materials")
+    given: Any = {name: getattr(plan, name) for name in _SAME}
+    usual = _Options(data=data, out=Path("runs") / f"compare-{plan.name}-{data.name}", **given)
+    choices = {"plans": PLANS, "data": DatasetConfig.choices, "recipes": RECIPES}
+    manual = _MANUAL.format(**{name: "|".join(values) for name, values in choices.items()}, recipe=plan.recipe)
+    options = parse(_Options, rest, "compare", default=usual, description=manual)
+    pick_device(options.device)
     same = {name: getattr(options, name) for name in ("data", *_SAME)}
     changes = {**plan.set, **dict(setting(text) for text in options.set)}
-    recipe = chosen.get("--recipe", plan.recipe)
     plan = replace(plan.only(options.rows), recipe=recipe, set=changes, **same)
     config = ProbeConfig(probes=plan.probes, tasks=plan.tasks, modalities=plan.modalities)
     if not options.dry_run:
@@ -97,16 +104,3 @@ def compare(argv: list[str]) -> None:
         written = write_tables(gather_folds(plan, works, options.out, config), options.out)
     text = [line if line.startswith("|") else fill(line, 80) for line in written[0].read_text().splitlines()]
     print(*text, "", *(f"written: {path}" for path in written), sep="\n")
-
-
-def _parse(chosen: dict[str, str], rest: list[str], plan: Plan) -> _Options:
-    check_known("recipe", [chosen.get("--recipe", plan.recipe)], RECIPES)
-    data = dataset(chosen["--data"]) if "--data" in chosen else plan.data
-    data = data or dataset("grasps" if plan.name == "table2" else "materials")
-    same: Any = {name: getattr(plan, name) for name in _SAME}
-    usual = _Options(data=data, out=Path("runs") / f"compare-{plan.name}-{data.name}", **same)
-    choices = {"plans": PLANS, "data": DatasetConfig.choices, "recipes": RECIPES}
-    manual = _MANUAL.format(**{name: "|".join(values) for name, values in choices.items()}, recipe=plan.recipe)
-    options = parse(_Options, rest, "compare", default=usual, description=manual)
-    pick_device(options.device)
-    return options

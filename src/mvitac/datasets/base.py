@@ -73,11 +73,6 @@ class DatasetConfig(Registered):
         """How ``build`` stores the pack."""
         return {name: getattr(self, name) for name in ("size", "workers", "store", "quality")}
 
-    @property
-    def without_effect(self) -> tuple[str, ...]:
-        """Fields that do not change the outcome of a run: local options, and how raw pixels would be compressed."""
-        return (*self.local, "store", "quality") if self.store == "raw" else self.local
-
     def source(self) -> "Source":
         """Return the source of samples; ValueError if the data does not exist, or is packed already."""
         raise ValueError(f"--data {self.name} reads packs: there is nothing to pack, use it to train and to probe")

@@ -167,9 +167,8 @@ def parity(
     Returns num_rows; cosine by embedding (min, mean); accuracy by task (original, export, num labelled rows); errors of
     values by task. ValueError if they differ by more than a limit allows.
     """
-    chunks = []
-    for chunk in np.array_split(rows, max(1, len(rows) // 16)):  # batches of another size than the traced one
-        chunks.append(call([np.ascontiguousarray(pack.images[m][chunk]) for m in graph.modalities]))
+    parts = np.array_split(rows, max(1, len(rows) // 16))  # batches of another size than the traced one
+    chunks = [call([np.ascontiguousarray(pack.images[m][part]) for m in graph.modalities]) for part in parts]
     found = {name: np.concatenate([c[i] for c in chunks]) for i, name in enumerate(graph.outputs)}
     report: dict[str, Any] = {"num_rows": len(rows), "cosine": {}, "accuracy": {}, "values": {}}
     for name in (n for n in graph.outputs if n.startswith(("embedding_", "shared_"))):

@@ -153,13 +153,11 @@ def starts_of(runs: Sequence[Run], specs: Sequence[DataSpec]) -> list[tuple[Run,
     One run for each seed, trunk and image size: the first with all modalities and heads into a shared space. Further
     runs are added only for modalities that it lacks.
     """
-
-    def parts_of(run: Run, spec: DataSpec) -> tuple[set[str], int]:
+    built = []
+    for run, spec in zip(runs, specs, strict=True):
         with torch.device("meta"):
             method = run.method.build(spec, run.encoder.fresh())
-        return set(method.encoders()), len(method.projectors())
-
-    built = [(run, spec, *parts_of(run, spec)) for run, spec in zip(runs, specs, strict=True)]
+        built.append((run, spec, set(method.encoders()), len(method.projectors())))
     built.sort(key=lambda each: (len(each[2]), each[3]), reverse=True)
     found: list[tuple[Run, DataSpec]] = []
     covered: set[tuple[int, str, str, str, int]] = set()

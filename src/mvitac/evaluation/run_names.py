@@ -21,9 +21,13 @@ def names_of(paths: Sequence[Path], models: Sequence[Model]) -> list[str]:
     several = len({model.run.recipe for model in models}) > 1
     own = [m.run.method.name + f" ({m.run.recipe})" * several for m in models]
     names = ["base" if path == BASE else name for name, path in zip(own, paths, strict=True)]
-    alike: dict[str, dict[str, dict[int, Path]]] = {}  # name -> settings -> seed -> folder
+    alike: dict[str, dict[str, dict[int, Path]]] = {}  # name -> digest of the settings -> seed -> folder
     for name, path, model in zip(names, paths, models, strict=True):
-        seeds = alike.setdefault(name, {}).setdefault(_settings(path, model), {})
+        asked, record = load_run(path) if (path / "run.json").exists() else (model.run, {})
+        # All settings but the seed, and the data. The precision is what was asked for: `auto` may differ by seed.
+        settings = replace(model.run, seed=0, data=PackConfig(), precision=asked.precision).digest()
+        key = digest([settings, record.get("pack") or to_json(model.run.data)])
+        seeds = alike.setdefault(name, {}).setdefault(key, {})
         if model.run.seed in seeds:
             same = f"{seeds[model.run.seed]} and {path} are the same run (equal settings, seed {model.run.seed})"
             raise ValueError(f"{same}: they would count as two seeds, give one of them")
@@ -38,11 +42,3 @@ def names_of(paths: Sequence[Path], models: Sequence[Model]) -> list[str]:
         for group, place in zip(folders, places, strict=True):
             where |= dict.fromkeys(group, f" ({place})" if len(folders) > 1 else "")
     return [name + where[path] for name, path in zip(names, paths, strict=True)]
-
-
-def _settings(path: Path, model: Model) -> str:
-    """Digest of the settings that were asked for but the seed, and the data. Runs that share it are seeds of one."""
-    asked, record = load_run(path) if (path / "run.json").exists() else (model.run, {})
-    data = record.get("pack") or to_json(model.run.data)
-    # The precision that was asked for: `auto` may mean another one for each seed.
-    return digest([replace(model.run, seed=0, data=PackConfig(), precision=asked.precision).digest(), data])

@@ -14,8 +14,7 @@ from torch import Tensor, nn
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
-from mvitac.nn import vit
-from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, keep_modes
+from mvitac.nn.encoders import SCRATCH, Encoders, keep_modes
 from mvitac.registry import Registered, check_range
 
 RANGES = {
@@ -181,11 +180,6 @@ class MethodConfig(Registered, ABC):
         """The method on a trunk that is built in no time, to find out whether and how it works on the dataset."""
         trunk = "mvitac_tiny_vit" if self.needs_vit else "mvitac_tiny"
         return self.build(spec, encoder.changed(trunk=trunk, weights=SCRATCH))
-
-    def check_encoder(self, encoder: EncoderConfig, size: int) -> None:
-        """Raise ValueError if the method cannot train ``encoder`` of a modality on views of ``size`` px."""
-        if self.needs_vit:
-            vit.check_vit(encoder, self.name, size)
 
     def check_modalities(self, spec: DataSpec) -> None:
         """Raise ValueError if the method ``needs_pairs`` and the dataset lacks a modality."""

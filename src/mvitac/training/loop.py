@@ -124,13 +124,11 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
             if (save or evaluate) and not torch.stack([each.isfinite().all() for each in method.parameters()]).all():
                 raise _diverged(f"weights are not finite after step {done}", run)
 
-            # Evaluate on held-out groups (split val).
             if log:
                 log.advance(done)
                 if evaluate and validation:
                     validation(done, last=last)
 
-            # Save a checkpoint.
             if save and world.is_main:
                 _check_still_there(out)
                 checkpoint.save(out, run, method, step.optimiser, done, setup.validation_state)

@@ -72,7 +72,12 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     asked = replace(asked, init=asked.init.resolved())
     device = pick_device(local_device(asked.device))
     pack = open_pack(asked.data, world, quiet) if pack is None else pack
-    rows = _rows(asked, pack, world)
+    if asked.positives_within:
+        places(pack, pack.spec.window)
+    rows = asked.method.training_rows(pack)
+    asked.check(pack.spec, len(rows), pack.size)
+    check_divisible(asked, world)
+    check_mix(asked, pack, rows, world)
     resumed = (out / "run.json").exists()
     hardware = _hardware(asked, pack, device, world, out if resumed else None)
     run = replace(asked, precision=hardware.precision)
@@ -94,17 +99,6 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     if world.is_main:
         _record(setup, asked, out, start, taken, quiet=quiet)
     return setup
-
-
-def _rows(run: Run, pack: Pack, world: World) -> np.ndarray:
-    """The rows of ``pack`` to train on; ValueError if a setting does not fit them, before anything is written."""
-    if run.positives_within:
-        places(pack, pack.spec.window)
-    rows = run.method.training_rows(pack)
-    run.check(pack.spec, len(rows), pack.size)
-    check_divisible(run, world)
-    check_mix(run, pack, rows, world)
-    return rows
 
 
 def _record(setup: Setup, asked: Run, out: Path, start: Start | None, taken: dict[str, Any], *, quiet: bool) -> None:

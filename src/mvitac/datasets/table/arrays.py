@@ -108,10 +108,8 @@ def _unwritten(file: Path, datasets: dict[str, Any]) -> Iterator[str]:
         if hasattr(data, "nchunks_initialized"):  # zarr
             num, there = data.nchunks, data.nchunks_initialized
         elif data.chunks:
-            num, there = (
-                prod(-(-side // of) for side, of in zip(data.shape, data.chunks, strict=True)),
-                data.id.get_num_chunks(),
-            )
+            num = prod(-(-side // of) for side, of in zip(data.shape, data.chunks, strict=True))
+            there = data.id.get_num_chunks()
         else:
             num, there = 1, int(data.id.get_storage_size() > 0 or not data.size)
         if there < num:

@@ -106,7 +106,10 @@ class TouchAndGo(Source):
         else:
             lists.assign_by_recording(listed, config.test_share, config.val_part, config.split_seed)
         self._recordings = {recording.name: recording for recording in found}
-        self._chunks = _chunks(listed)
+        self._chunks: list[list[Frame]] = []
+        for _, own in itertools.groupby(listed, key=lambda frame: frame.recording):
+            recording = list(own)
+            self._chunks += [recording[i : i + CHUNK] for i in range(0, len(recording), CHUNK)]
         frames = [(chunk[0].recording, [frame.number for frame in chunk]) for chunk in self._chunks]
         self._stamps = [one_stamp(self._recordings[name].stamps(numbers)) for name, numbers in frames]
         notes = lists.leaks(listed) if config.split == "official" else []
@@ -150,15 +153,6 @@ class TouchAndGo(Source):
                 columns = _columns(frame, self._spec)
                 samples.append(Sample(vision=own.get("vision"), touch=own.get("touch"), columns=columns))
         return samples
-
-
-def _chunks(frames: Sequence[Frame]) -> list[list[Frame]]:
-    """Divide frames, sorted by recording and number, into items: up to ``CHUNK`` frames of one recording."""
-    chunks: list[list[Frame]] = []
-    for _, own in itertools.groupby(frames, key=lambda frame: frame.recording):
-        recording = list(own)
-        chunks += [recording[i : i + CHUNK] for i in range(0, len(recording), CHUNK)]
-    return chunks
 
 
 def _columns(frame: Frame, spec: DataSpec) -> dict[str, Any]:
