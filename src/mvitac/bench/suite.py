@@ -175,9 +175,8 @@ class Opened:
     def beside(self) -> str:
         """Digest of what scores and controls depend on, too, and ``digests`` have not: the data's controls, touches."""
         pack = self.packs[0]
-        used = {
-            name: [pack.column(c).astype(str).tolist() for c in columns] for name, columns in pack.spec.controls.items()
-        }
+        controls = pack.spec.controls.items()
+        used = {name: [pack.column(c).astype(str).tolist() for c in columns] for name, columns in controls}
         return digest([used, pack.touch_groups.tolist()])
 
 

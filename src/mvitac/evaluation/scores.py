@@ -176,9 +176,8 @@ def per_class(records: Sequence[dict[str, Any]], classes: Mapping[str, Sequence[
             continue
         counts = np.sum([record["confusion"] for record in each], axis=0)
         about = zip(classes[task], np.sum(each[0]["confusion"], axis=1).tolist(), each[0]["class_groups"], strict=True)
-        of_task = found.setdefault(task, {}).setdefault(
-            modality, [{"class": name, "rows": rows, "groups": groups, "scores": {}} for name, rows, groups in about]
-        )
+        new = [{"class": name, "rows": rows, "groups": groups, "scores": {}} for name, rows, groups in about]
+        of_task = found.setdefault(task, {}).setdefault(modality, new)
         right, said, true = counts.diagonal(), counts.sum(0), counts.sum(1)
         for k, one in enumerate(of_task):
             one["scores"][source] = [float(right[k] / n) if n else None for n in (said[k], true[k])]
