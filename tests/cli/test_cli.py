@@ -147,8 +147,5 @@ def test_the_demo_starts_from_imagenet_where_its_weights_are(
 
 def test_epochs_replace_the_steps_of_a_recipe(pack: Pack) -> None:
     chosen = {"--recipe": "smoke", "--data": str(pack.path)}
-    assert [_chosen_run(chosen, words, True).steps for words in ([], ["--epochs", "2"], ["--epochs=2"])] == [
-        8,
-        None,
-        None,
-    ]
+    steps = [_chosen_run(chosen, words, True).steps for words in ([], ["--epochs", "2"], ["--epochs=2"])]
+    assert steps == [8, None, None]

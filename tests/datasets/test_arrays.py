@@ -218,11 +218,8 @@ def test_a_replay_buffer_in_zarr(tmp_path: Path, kind: str) -> None:
     with zarr.storage.ZipStore(path, mode="w") if kind == "zip" else nullcontext(str(path)) as store:
         root = zarr.open_group(store, mode="w", zarr_format=3 if kind == "v3" else 2)
         content = {"data/camera": grays(*range(20)), "data/gel": grays(*range(100, 120))}
-        content |= {
-            "data/force": np.arange(20) / 4,
-            "data/state": np.arange(40).reshape(20, 2),
-            "meta/episode_ends": np.array([4, 9, 14, 20]),
-        }
+        content |= {"data/force": np.arange(20) / 4, "data/state": np.arange(40).reshape(20, 2)}
+        content["meta/episode_ends"] = np.array([4, 9, 14, 20])
         root.create_group("data", attributes={"robot": "arm"})
         for name, value in content.items():
             root.create_array(name, data=value)
@@ -294,10 +291,8 @@ def test_numbers_of_more_than_8_bits(tmp_path: Path) -> None:
     options: dict[str, Any] = {"path": tmp_path / "a.h5", "size": 16, "group": "frame"}
     pack = packed(FolderConfig(**options), tmp_path / "p")
     assert levels(pack, "touch") == np.rint(deep[:, 0, 0, 0] * 255).tolist() and max(levels(pack, "vision")) == 8
-    assert (
-        "vision has more than 8 bits: 0 is black, 65535 white touch has more than 8 bits: 0 is black, 1 white"
-        in " ".join(pack.spec.notes)
-    )
+    said = "vision has more than 8 bits: 0 is black, 65535 white touch has more than 8 bits: 0 is black, 1 white"
+    assert said in " ".join(pack.spec.notes)
     pack = packed(FolderConfig(**options, range=("vision=0:2000",)), tmp_path / "q")
     assert max(levels(pack, "vision")) == 255 and "0 is black, 2000 white" in " ".join(pack.spec.notes)
     write(tmp_path / "b.h5", {"touch": grays(*range(20)).astype(np.int64), "vision": (300 * deep[..., :1]).astype(int)})

@@ -211,9 +211,8 @@ def test_two_lists_of_times_are_one_too_many(tmp_path: Path) -> None:
     root = recorded(tmp_path / "set", num=2)
     own_times("txt", *(0.04 * i for i in range(50)))(root)
     own_times("csv", "time", *(0.05 * i for i in range(50)))(root)
-    with pytest.raises(
-        ValueError, match=r"gel_timestamps\.txt and gel_timestamps\.csv both have the times of gel\.mp4"
-    ):
+    says = r"gel_timestamps\.txt and gel_timestamps\.csv both have the times of gel\.mp4"
+    with pytest.raises(ValueError, match=says):
         packed(root, tmp_path / "p", **LOG)
 
 

@@ -377,10 +377,8 @@ def test_a_real_recording_without_its_camera_video(tmp_path: Path) -> None:
 
 def test_the_suite_of_the_bench_reads_both_splits(tree: Path, tmp_path: Path) -> None:
     (tmp_path / "touch_and_go").symlink_to(tree)
-    small = [
-        replace(one, forms=(replace(f := one.forms[0], data={**f.data, "size": 16}),))
-        for one in find_suite("tag-v1").sets
-    ]
+    sets = find_suite("tag-v1").sets
+    small = [replace(one, forms=(replace(f := one.forms[0], data={**f.data, "size": 16}),)) for one in sets]
     by_recording, official = (open_set(one, tmp_path) for one in small)
     assert not isinstance(by_recording, str) and not isinstance(official, str)
     shared = []

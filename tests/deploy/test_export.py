@@ -74,10 +74,7 @@ def test_where_8_bits_are_too_few_the_way_out_is_said(
     model: Model, onnx: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(exports, "quantise", lambda *_: None)
-    for precision, says in (
-        ("int8", r"\(min_cosine\); fp32 or bf16 may hold it"),
-        ("fp32", r"\(min_cosine\)$"),
-    ):
+    for precision, says in (("int8", r"\(min_cosine\); fp32 or bf16 may hold it"), ("fp32", r"\(min_cosine\)$")):
         with copied(onnx), pytest.raises(ValueError, match=says):
             export(model, pack, tmp_path / precision, ExportConfig(precision=precision, min_cosine=1.1))  # type: ignore
 

@@ -153,10 +153,9 @@ def test_without_a_list_leaks_are_unknown(run: Path, turned: Pack) -> None:
 
 def test_groups_leak_where_no_row_does(pack: Pack) -> None:
     first, second = (pack.rows("train")[i::2] for i in range(2))
-    assert Scored(pack).leak([source_of(pack, first)], second) == (
-        f"0 of {len(second)} test rows and {len(np.unique(pack.column('group')[second]))} of"
-        f" {len(np.unique(pack.column('group')[second]))} test instances were trained on (toy)"
-    )
+    num = len(np.unique(pack.column("group")[second]))
+    leak = f"0 of {len(second)} test rows and {num} of {num} test instances were trained on (toy)"
+    assert Scored(pack).leak([source_of(pack, first)], second) == leak
 
 
 def test_every_source_of_a_run_counts(pack: Pack, tmp_path: Path) -> None:

@@ -176,9 +176,8 @@ def test_folds_test_every_group_once_that_no_run_learned_from(pack: Pack, runs: 
         fold_splits(pack, task, 61, [])
     few = np.full(pack.num, -1)
     few[[np.flatnonzero(pack.column("label_pattern") == k)[0] for k in range(3)]] = range(3)  # one row of each class
-    assert [list(split).count("test") for split in fold_splits(with_columns(pack, label_pattern=few), task, 3, [])] == [
-        1
-    ] * 3
+    splits = fold_splits(with_columns(pack, label_pattern=few), task, 3, [])
+    assert [list(split).count("test") for split in splits] == [1] * 3
     before = (runs[0] / "probe.json").exists()
     found = probe_runs(runs, ProbeConfig(folds=3, tasks=("pattern", "bright"), modalities=("touch",)))
     num = len(pack.rows("val", "test"))
@@ -214,9 +213,7 @@ def test_a_folded_network_is_used_only_where_it_is_the_same(
         made.encoders["touch"].conv1[0].weight.data *= 2
     monkeypatch.setattr("mvitac.evaluation.features._folded", lambda *_: made)
     read, whole = [], Model.features
-    monkeypatch.setattr(
-        Model, "features", lambda self, *args, **more: (read.append(self), whole(self, *args, **more))[1]
-    )
+    monkeypatch.setattr(Model, "features", lambda self, *given, **how: read.append(self) or whole(self, *given, **how))
     found = features_module.pack_features(model, pack, "touch", rows)
     assert read[:3] == [model, made, made if same else model] and kept == {n: id(m) for n, m in model.named_modules()}
     torch.testing.assert_close(found[:50], features_module.pack_features(model, pack, "touch", rows[:50]))
@@ -296,10 +293,8 @@ def test_classes_that_train_lacks_are_named_below_the_scores(runs: list[Path], p
         labels[rows] = labels[rows] % 2  # nothing is a "rows"
     asked = ProbeConfig(probes=("knn",), tasks=("pattern",), modalities=("touch",), controls=False)
     found = probe_runs(runs[:1], asked, with_columns(pack, label_pattern=labels))
-    num = (labels[test] == 2).sum()
-    assert found["notes"] == [
-        f"pattern: {num} of {len(test)} test rows have classes that train lacks: {pack.spec.tasks[0].classes[2]}"
-    ]
+    num, name = (labels[test] == 2).sum(), pack.spec.tasks[0].classes[2]
+    assert found["notes"] == [f"pattern: {num} of {len(test)} test rows have classes that train lacks: {name}"]
 
 
 def test_seeds_whose_automatic_precision_differs_are_seeds_of_one_run(pack: Pack, tmp_path: Path) -> None:

@@ -73,9 +73,8 @@ def test_equals_the_convolution_and_its_gradients(
 
 
 def test_gradients_have_the_weights_layout_and_bf16_autocast_is_as_close_as_the_convolution() -> None:
-    conv = use_products(nn.Sequential(nn.Conv2d(5, 7, 3, padding=1, bias=False))).to(memory_format=torch.channels_last)[
-        0
-    ]  # type: ignore[index]
+    network = use_products(nn.Sequential(nn.Conv2d(5, 7, 3, padding=1, bias=False)))
+    conv = network.to(memory_format=torch.channels_last)[0]  # type: ignore[index]
     images = torch.randn(4, 5, 2, 2).to(memory_format=torch.channels_last)
     conv(images).square().sum().backward()
     assert conv.weight.grad is not None
@@ -141,10 +140,8 @@ def test_timms_vits_take_images_of_any_size_and_keep_their_weights() -> None:
 
 @pytest.mark.parametrize("registers", [0, 4])
 def test_visible_patches_keep_their_positions_behind_class_token_and_registers(registers: int) -> None:
-    vit = VisionTransformer(
-        32, 8, 3, 0, embed_dim=64, depth=2, num_heads=2, reg_tokens=registers, dynamic_img_size=True
-    )
-    vit.eval()
+    shape = {"embed_dim": 64, "depth": 2, "num_heads": 2, "reg_tokens": registers}
+    vit = VisionTransformer(32, 8, 3, 0, **shape, dynamic_img_size=True).eval()  # type: ignore[arg-type]
     images, order = torch.randn(2, 3, 32, 32), torch.stack([torch.randperm(16) for _ in range(2)])
     whole, seen = vit.forward_features(images), encode_visible(vit, images, order).values
     front = 1 + registers

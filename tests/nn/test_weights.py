@@ -114,14 +114,8 @@ def loaded(whole: dict[str, Any], folder: Path) -> nn.Module:
 WRAPPED: dict[str, Callable[[State], dict[str, Any]]] = {
     "": dict,
     "module.": lambda state: behind("module.", state),
-    "state_dict.module.encoder_q.": lambda state: {
-        "state_dict": behind("module.encoder_q.", state) | OUTSIDE,
-        "epoch": 3,
-    },
-    "model.backbone.": lambda state: {
-        "model": behind("backbone.", state),
-        "optimizer": {"state": {0: {"m": torch.ones(2)}}},
-    },
+    "state_dict.module.encoder_q.": lambda w: {"state_dict": behind("module.encoder_q.", w) | OUTSIDE, "epoch": 3},
+    "model.backbone.": lambda w: {"model": behind("backbone.", w), "optimizer": {"state": {0: {"m": torch.ones(2)}}}},
     "encoder.": lambda state: behind("encoder.", state),
 }
 
@@ -136,9 +130,8 @@ def test_usual_beginnings_of_names_are_understood_and_said(
     build_trunk(EncoderConfig(trunk=NAME, weights=str(tmp_path / "w.pth")), 3)  # the other sense
     said = capsys.readouterr().err
     assert said.count("\n") == bool(start) and f"weights read below {start!r}" * bool(start) in said
-    assert ("left out: 2 tensors (state_dict.queue, state_dict.module.encoder_k.conv1.weight)" in said) == (
-        "_q" in start
-    )
+    outside = "left out: 2 tensors (state_dict.queue, state_dict.module.encoder_k.conv1.weight)"
+    assert (outside in said) == ("_q" in start)
     assert ("left out: 1 tensor (optimizer.state.0.m)" in said) == ("backbone" in start)
 
 
@@ -192,19 +185,13 @@ def test_positions_of_another_size_are_those_that_timm_makes(tmp_path: Path) -> 
     large = timm.create_model("test_vit", img_size=160)
     with pytest.raises(ValueError, match="left over"):  # two sets of weights, of which timm would take the second
         load_weights(large, large.state_dict() | behind("visual.trunk.", large.state_dict()), "file")
+    fine = timm.create_model("test_vit", img_size=160, patch_size=8, num_classes=0)
     with pytest.raises(ValueError, match=r"patch_embed\.proj\.weight .* of another shape"):
-        load_weights(
-            timm.create_model("test_vit", img_size=160, patch_size=8, num_classes=0), large.state_dict(), "file"
-        )
-    small = timm.create_model("test_vit", img_size=96, num_classes=0)
+        load_weights(fine, large.state_dict(), "file")
+    shape: dict[str, Any] = {"img_size": 96, "num_classes": 0}
+    small, given = timm.create_model("test_vit", **shape), {"state_dict": large.state_dict()}
     load_weights(small, large.state_dict(), "file")
-    expected = timm.create_model(
-        "test_vit",
-        img_size=96,
-        num_classes=0,
-        pretrained=True,
-        pretrained_cfg_overlay={"state_dict": large.state_dict()},
-    )
+    expected = timm.create_model("test_vit", **shape, pretrained=True, pretrained_cfg_overlay=given)
     for name, value in small.state_dict().items():
         assert torch.equal(value, expected.state_dict()[name]), name
 

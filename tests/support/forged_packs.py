@@ -44,8 +44,6 @@ def described(*keys: str, value: Any) -> Spoil:
 
     def spoil(path: Path) -> None:
         edited(path / "pack.json", keys, value)
-        meta = json.loads((path / "pack.json").read_text())
-        meta.pop("digest", None)
-        (path / "pack.json").write_text(json.dumps({**meta, "digest": digest(meta)}))
+        seal(path)
 
     return spoil
