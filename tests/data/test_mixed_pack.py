@@ -83,12 +83,6 @@ def test_a_control_of_one_part_is_no_value_of_another(gel: Pack, tmp_path: Path)
     assert mix.spec.controls["force"] == ("control/force",)
     np.testing.assert_array_equal(mix.column("control/force")[~inside], 1000.0 * np.arange(30))
     assert np.isnan(mix.column("control/force")[inside]).all()
-    other = altered(pressed(60), values=(ValueTask(name="load", targets=(Target(name="force", unit="mN"),)),))
-    names = [
-        task.name
-        for task in MixedPack({"a": built(pressed(), tmp_path / "c"), "b": built(other, tmp_path / "d")}).spec.values
-    ]
-    assert names == ["a/force", "b/load"]
 
 
 def pressed(first: int = 0, unit: str = "N", kind: Any = 1, own_split: bool = False) -> Toy:

@@ -24,6 +24,7 @@ from mvitac.data.images import decode, fit, shrink
 from mvitac.data.pack import Pack
 from mvitac.data.spec import UNGROUPED
 from mvitac.datasets.folder import FolderConfig
+from mvitac.datasets.table.columns import Condition
 from mvitac.datasets.table.splits import assign_splits
 from mvitac.datasets.table.table import Rows
 from mvitac.recipes import recipe
@@ -212,6 +213,12 @@ def test_two_ways_to_type_a_name_are_one(tmp_path: Path, rows: Table) -> None:
     assert pack.spec.tasks[0].classes == ("Nan", "caf\u00e9 au lait") == other.spec.tasks[0].classes
     assert set(pack.column("group")) == {f"tasse {i:03d}" for i in (0, 1, 3, 4, 5, 6, 7)}
     assert pack.digest == other.digest
+
+
+@pytest.mark.parametrize(("cell", "wanted"), [("0.10", "0.1"), ("1e1", "10.0"), ("True", "true"), ("2", "2")])
+def test_equal_numbers_and_truths_are_equal(cell: str, wanted: str) -> None:
+    assert Condition.parse(f"a={wanted}").holds({"a": cell}) and not Condition.parse(f"a!={wanted}").holds({"a": cell})
+    assert Condition.parse("a!=07").holds({"a": "7"})  # names of objects
 
 
 def test_unlabelled_rows_are_kept_for_pre_training_only(tmp_path: Path, rows: Table) -> None:

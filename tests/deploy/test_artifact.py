@@ -12,9 +12,12 @@ import mvitac
 from mvitac.data.pack import Pack
 from mvitac.deploy.artifact import ARTIFACT, preprocessing
 from mvitac.deploy.card import card
+from mvitac.deploy.publish import publish, with_probes
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import fitting
 from mvitac.evaluation.probe import split_rows
+from mvitac.model import load
+from support.toy import with_columns
 
 
 def test_predicts_what_the_probe_scored(smoke_run: Path, artifact: Path, pack: Pack) -> None:
@@ -51,6 +54,14 @@ def test_the_card_names_what_encoders_and_what_probes_learned_from(artifact: Pat
     assert "Encoders: toy; source: tests/support/toy.py; licence: none." in text
     assert "Probes: other; source: others; licence: CC-BY." in text
     assert "under: none, and CC-BY" in text and "without labels" not in text
+
+
+def test_the_part_of_images_is_that_of_the_data_of_the_probes(smoke_run: Path, pack: Pack, tmp_path: Path) -> None:
+    """Their answers are for images that show as much."""
+    part = {"touch": "0:0:9:9"}
+    publish(smoke_run, tmp_path / "a", with_columns(pack, spec=replace(pack.spec, crop=part)), allow_leak=True)
+    assert mvitac.load(tmp_path / "a").spec.crop == part
+    assert with_probes(load(smoke_run), with_columns(pack, spec=replace(pack.spec, crop=part))).spec.crop == part
 
 
 def test_difference_images_are_told(smoke_run: Path, pack: Pack, tmp_path: Path) -> None:

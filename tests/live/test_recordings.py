@@ -164,12 +164,19 @@ def test_predict_command(
     assert main([*command, str(tmp_path / "pairs.csv"), "--touch", "gel", "--out", str(tmp_path / "one.csv")]) == 0
     one, row = pyarrow.csv.read_csv(tmp_path / "one.csv"), pyarrow.csv.read_csv(out).slice(7, 1)
     assert one.column("pattern.rows").to_pylist() == pytest.approx(row.column("pattern.rows").to_pylist(), abs=1e-5)
-    capsys.readouterr()
+    assert "split" in row.column_names and not {"group", "split"} & {*one.column_names}  # made up for a new table
+    assert "warning" not in capsys.readouterr().err
     (tmp_path / "some.csv").write_text("vision,touch\nvision.png,touch.png\n,touch.png\n")
-    some = FolderConfig(path=tmp_path / "some.csv", allow_missing=True, allow_leak=True, size=32)
-    build(some.source(), tmp_path / "some", size=32, quiet=True)
-    assert main([*command, str(tmp_path / "some"), "--out", str(out)]) == 0
-    assert "1 of 2 rows are left out" in capsys.readouterr().err
+    crop: Any = {"crop": ("touch=0:0:16:16",), "allow_missing": True, "allow_leak": True}
+    some = FolderConfig(path=tmp_path / "some.csv", size=32, **crop).source()
+    for side in (32, 16):
+        build(some, tmp_path / f"some{side}", size=side, quiet=True)
+    assert main([*command, str(tmp_path / "some32"), "--out", str(out)]) == 0
+    said = capsys.readouterr().err
+    assert "1 of 2 rows are left out" in said
+    assert "touch shows 0:0:16:16 of the images, the model learned from the whole" in said
+    assert main([*command, str(tmp_path / "some16"), "--out", str(out)]) == 2
+    assert "some16 has images of vision of (16, 16, 3), the model takes (32, 32, 3)" in capsys.readouterr().err
     (tmp_path / "gel.csv").write_text("touch\ntouch.png\n")
     assert main([*command, str(tmp_path / "gel.csv"), "--out", str(out)]) == 2
     assert "has no vision, which the model takes too" in capsys.readouterr().err

@@ -174,7 +174,13 @@ def predict(argv: list[str]) -> None:
         raise ValueError(f"{options.model} has no probes of classes or values: export it on data that has labels")
     if config:
         pack = _opened(config, given, next(iter(engine.inputs.values()))[0])
-        if num := pack.num - _write(options.out, pack_tables(engine, pack), pack.num):
+        for m in [m for m in engine.inputs if pack.spec.crop.get(m) != engine.crop.get(m)]:
+            have, wanted = (crop.get(m, "the whole") for crop in (pack.spec.crop, engine.crop))
+            _say(
+                f"mvitac: warning: {m} shows {have} of the images, the model learned from {wanted}: pack it with --crop"
+            )
+        about = ("group", "split") if isinstance(config, PackConfig) else ()  # those of a new table mean nothing
+        if num := pack.num - _write(options.out, pack_tables(engine, pack, about), pack.num):
             _say(f"{num} of {pack.num} rows are left out: without an image that the model takes")
         return
     opened = dict.fromkeys(engine.inputs, single) if single else opened

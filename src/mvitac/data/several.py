@@ -7,7 +7,6 @@ other.
 import functools
 import itertools
 import re
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -153,10 +152,7 @@ def _mixed_tasks(parts: Mapping[str, Pack]) -> dict[str, Tasks]:
     """The tasks of each part. Those of one name that mean the same are one; others become <part>/<name>."""
     tasks = [task for pack in parts.values() for task in pack.spec.all_tasks]
     first = {task.name: task for task in reversed(tasks)}
-    targets = {target for task in tasks if isinstance(task, ValueTask) for target in task.targets}
-    units = Counter(target.name for target in targets)
-    two_units = {t.name for t in tasks if isinstance(t, ValueTask) and any(units[one.name] > 1 for one in t.targets)}
-    shared = {name for name in first if len({_meaning(task) for task in tasks if task.name == name}) == 1} - two_units
+    shared = {name for name in first if len({_meaning(task) for task in tasks if task.name == name}) == 1}
     return {
         part: {t.name: first[t.name] if t.name in shared else _of_part(part, t) for t in pack.spec.all_tasks}
         for part, pack in parts.items()

@@ -132,6 +132,7 @@ def with_probes(model: Model, pack: Pack) -> Model:
     """``model`` with probes: its own if it has some (an artifact), else fitted on ``pack``."""
     if not model.probes:
         model.probes = {probe.info.name: probe for probe, _ in fit_probes(model, as_trained(model, pack))}
+        model.spec = replace(model.spec, crop=pack.spec.crop)  # what the answers are for
     return model
 
 
@@ -168,7 +169,7 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
             pack = noted(own_data(model, "fit the probes on a pack, --on PACK"), [run])
         learned, scores = _fit_and_score(run, model, pack, allow_leak)
         met = sensors_of(pack, pack.rows("train", "val", "unlabelled"))  # by the probes, if not by the encoders
-        model.spec = replace(model.spec, sensors=tuple(sorted({*model.spec.sensors, *met})))
+        model.spec = replace(model.spec, sensors=tuple(sorted({*model.spec.sensors, *met})), crop=pack.spec.crop)
         model.save(partial / "model.safetensors", half=half)
         if model.probes:
             tensors = {f"{r.info.name}.{k}": v for r in model.probes.values() for k, v in r.state_dict().items()}

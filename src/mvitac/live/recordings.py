@@ -14,7 +14,7 @@ import numpy as np
 from mvitac.data.pack import Pack
 from mvitac.data.spec import Window
 from mvitac.data.windows import windowed
-from mvitac.deploy.engine import Engine, spread_at
+from mvitac.deploy.engine import Engine, frame_shapes, spread_at
 from mvitac.live.cameras import Recording
 from mvitac.live.contact import LiveConfig
 from mvitac.live.predictor import Live, own_name
@@ -54,17 +54,23 @@ def answers(engine: Engine, outputs: dict[str, np.ndarray]) -> Table:
     return table
 
 
-def pack_tables(engine: Engine, pack: Pack) -> Iterator[Table]:
-    """Tables of the rows of a pack that have all images; ValueError if the model was trained on others."""
+def pack_tables(engine: Engine, pack: Pack, about: Sequence[str] = ("group", "split")) -> Iterator[Table]:
+    """Tables of the rows of a pack that have all images; ValueError if the model was trained on others.
+
+    ``about``: further columns of the pack.
+    """
     for modality in engine.inputs:
         if modality not in pack.images:
             raise ValueError(f"{pack.path} has no {modality}, which the model takes too")
+        have, takes = pack.images[modality].shape[1:], frame_shapes(engine)[modality]
+        if have != takes:
+            raise ValueError(f"{pack.path} has images of {modality} of {have}, the model takes {takes}: pack it so")
     if pack.spec.difference != engine.difference:
         raise ValueError(f"{pack.path}: touch minus its background, in the model or in the pack only")
     if engine.window:
         pack = windowed(pack, from_json(Window, {k: v for k, v in engine.window.items() if k != "layout"}))
     rows = np.flatnonzero(np.logical_and.reduce([pack.has(m) for m in engine.inputs]))
-    known = [name for name in ("time", "contact", "id", "group", "split") if name in pack.table.column_names]
+    known = [name for name in ("time", "contact", "id", *about) if name in pack.table.column_names]
     chunks = np.split(rows, range(BATCH, len(rows), BATCH))
     for some, images in prefetch((some, {m: pack.images[m][some] for m in engine.inputs}) for some in chunks):
         told = {name: pack.column(name)[some] for name in known}

@@ -36,6 +36,10 @@ class Condition:
         if self.sign in COMPARE:
             number = number_of(cell)
             return number is not None and COMPARE[self.sign](number, float(wanted))
+        if wanted.casefold() in ("true", "false"):
+            cell, wanted = cell.casefold(), wanted.casefold()
+        elif "." in cell + wanted and None not in (numbers := (number_of(cell), number_of(wanted))):  # 0.10 is 0.1
+            return (numbers[0] == numbers[1]) == (self.sign == "=")
         return (cell == wanted) == (self.sign == "=")
 
 
