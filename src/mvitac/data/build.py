@@ -52,9 +52,7 @@ def build(
     quality: int = QUALITY,
     exist_ok: bool = False,
 ) -> Pack:
-    """Read ``source`` into a new pack.
-
-    An interrupted build continues from ``<out>.partial``. If another process builds the same pack, this one waits for it.
+    """Read ``source`` into a new pack; an interrupted build continues from ``<out>.partial``.
 
     Args:
         source: The dataset to read.
@@ -88,7 +86,6 @@ def build(
 
 
 def _build(source: Source, out: Path, request: dict[str, Any], workers: int, max_damaged: float, quiet: bool) -> Pack:
-    """Build the pack in the process that holds the lock."""
     spec, items, counts = source.spec(), source.items(), source.samples_per_item()
     num, size = sum(counts), request["size"]
     if not num:

@@ -21,10 +21,7 @@ FEW = 8  # up to this number of images, one thread is faster than several
 
 
 def encode(image: np.ndarray, quality: int) -> bytes:
-    """Encode uint8 [S, S, C] as JPEG. Colours keep full resolution (4:4:4), because a gel shows slopes by colour.
-
-    Other builds of libjpeg may give other bytes.
-    """
+    """Encode uint8 [S, S, C] as JPEG, 4:4:4: a gel shows slopes by colour. Other builds of libjpeg may differ."""
     if not image.any():
         return b""
     size = len(image)

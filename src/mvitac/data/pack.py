@@ -7,7 +7,6 @@
            touch.npy         uint8 [N, size, size, 3 or 6]
 
 A pack stored as JPEG has ``vision.jpegs`` and ``touch.jpegs`` instead (``data/jpeg.py``) and columns bytes_<modality>.
-This module opens and checks packs; ``data/build.py`` builds them.
 """
 
 import copy

@@ -1,8 +1,4 @@
-"""Several packs as one: their rows one after another, images read where they are.
-
-``MixedPack`` is several packs to train on. ``JoinedPack`` is two for probes, which learn on the one and are scored on the
-other.
-"""
+"""Several packs as one, images read where they are: ``MixedPack`` to train on, ``JoinedPack`` for probes."""
 
 import functools
 import itertools
@@ -47,8 +43,7 @@ class _Several(Pack):
 class MixedPack(_Several):
     """The rows of all ``parts``, one part after another.
 
-    A row has the split, labels, values and groups that it has in its part (``_mixed_columns``). A part without a modality
-    has no image of it.
+    A row has the split, labels, values and groups of its part. A part without a modality has no image of it.
 
     Attributes:
         weights: How often each part is drawn in training, relative to the others; () = by its number of rows.

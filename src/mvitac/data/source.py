@@ -1,7 +1,4 @@
-"""The interface that a dataset implements: list items, read samples, return a fingerprint.
-
-Each worker process gets a copy of the source, so a source must be picklable and its module must not import torch.
-"""
+"""The interface that a dataset implements: list items, read samples, return a fingerprint."""
 
 import os
 import stat
@@ -55,7 +52,7 @@ def one_stamp(stamps: Iterable[Stamp]) -> int:
 
 
 class Source(ABC):
-    """A dataset to read samples from. It must be picklable, because packing uses several processes."""
+    """A dataset to read. Each worker gets a copy, so it must be picklable and its module must not import torch."""
 
     @abstractmethod
     def spec(self) -> DataSpec: ...
@@ -75,8 +72,7 @@ class Source(ABC):
     def stamps(self) -> Sequence[int] | None:
         """Return a number per item (``one_stamp``) that changes when one of its files does.
 
-        None if no files are read or the fingerprint covers their content. Stamps are not stored in the pack, which does
-        not depend on when a file was written.
+        None if no files are read or the fingerprint covers their content. The pack does not depend on stamps.
         """
         return None
 

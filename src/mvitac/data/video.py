@@ -60,7 +60,6 @@ def num_frames(path: str | Path) -> int:
 def frame_times(path: str | Path) -> np.ndarray:
     """Return the display times in seconds [N], ascending; ValueError or OSError if it cannot be read as a video."""
     with _opened(path) as (container, stream):
-        # As elsewhere here, frames cut off by an edit list do not count.
         shown = [p.pts for p in container.demux(stream) if p.size and not p.is_discard and p.pts is not None]
         return np.sort(np.array(shown, float)) * float(stream.time_base or 0)
 

@@ -1,7 +1,6 @@
 """Windows: a row that shows several frames of its touch, the current one and earlier ones, stacked on channels.
 
-A pack stores every frame once. ``windowed`` opens it so that ``pack.images`` gives windows, found by index when they are
-read. A window never crosses the edge of a touch (column touch_group, else group).
+A pack stores every frame once. A window never crosses the edge of a touch (column touch_group, else group).
 """
 
 import copy
@@ -78,8 +77,7 @@ def recordings(pack: Pack, place: np.ndarray) -> Iterator[np.ndarray]:
 
 def frames_of(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Row numbers of each row's frames [N, F], newest first; bool [N], whether its touch is long enough for all; and the
-    number [N] of the first row of its touch.
-    """
+    number [N] of the first row of its touch."""
     name, place = places(pack, window)
     back = window.stride * np.arange(window.frames)
     index, whole = np.zeros((pack.num, window.frames), np.int64), np.zeros(pack.num, bool)

@@ -6,10 +6,8 @@
           gelsightA_<phase>, gelsightB_<phase>   uint8 [960, 1280, 3]   phase: before, during, after
           kinectA_rgb_<phase>                    uint8 [540, 960, 3]
 
-One item is one grasp, read phase by phase with h5py, so memory does not depend on the size of a shard. 'before' is taken
-with open fingers, 'during' with closed fingers before the lift, and 'after' 4 s after the lift attempt, when the outcome is
-visible. Only rows of the phases in ``ask`` are labelled, so 'after' cannot be probed by mistake, and a task that uses it has
-a name that says so.
+'before' is taken with open fingers, 'during' with closed fingers before the lift, and 'after' 4 s after the lift
+attempt, when the outcome is visible. Only phases in ``ask`` are labelled, so 'after' cannot be probed by mistake.
 
 Sources: the owners' scripts (github.com/robertocalandra/the-feeling-of-success) for name repairs and the split
 by object; the authors' notebook (github.com/ligerfotis/mvitac, create_dataset.ipynb) for their 32 and 8 objects.

@@ -15,8 +15,6 @@ and the cameras of a **recording** by time:
     <root>/<name>/gel.mp4  camera.mp4           two cameras: ``touch`` gel, ``vision`` camera
     <root>/touch/<name>.mp4  vision/<name>.mp4  the same by folders; vision, touch, left and right need no option
     <root>/<number>.jpg                         one recording of one camera; a number of seconds since 1970 is its time
-
-A manifest is checked completely before the first image is decoded. Rows are counted from 1, without the header.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,4 @@
-"""Simulated touches of materials and simulated grasps (``sim/``), split by instance and by object.
-
-They are the default data: every experiment runs without a download. Results are not comparable with the paper's.
-"""
+"""Simulated touches of materials and simulated grasps (``sim/``), split by instance and by object."""
 
 import math
 from collections.abc import Sequence

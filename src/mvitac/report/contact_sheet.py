@@ -1,7 +1,4 @@
-"""A contact sheet of a pack, to check the data by eye: the suspicious rows, and a few pairs of each class or object.
-
-Check that camera and touch belong together, labels are right, colours look natural, and nothing is blank or upside down.
-"""
+"""A contact sheet of a pack, to check the data by eye: the suspicious rows, and a few pairs of each class or object."""
 
 import textwrap
 from collections.abc import Sequence

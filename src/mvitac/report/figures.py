@@ -1,7 +1,4 @@
-"""Figures of the report, drawn with matplotlib as PNG or SVG in the page's colours.
-
-No pyplot: no global state, nothing to close.
-"""
+"""Figures of the report, drawn with matplotlib as PNG or SVG in the page's colours, without pyplot's global state."""
 
 import io
 import warnings

@@ -26,10 +26,7 @@ def nearest_rows(values: np.ndarray, groups: np.ndarray, num: int = NUM_FOUND) -
 
 
 def spread(values: np.ndarray, num: int) -> np.ndarray:
-    """``num`` of N rows, each the least like all before by cosine of ``values`` [N, D], after the most typical one.
-
-    K-center greedy (arXiv:1708.00489).
-    """
+    """K-center greedy (arXiv:1708.00489) by cosine of ``values`` [N, D]: ``num`` of N rows, the most typical first."""
     alike = unit(values) @ unit(values).T
     chosen = [int(alike.sum(1).argmax())]
     while len(chosen) < min(num, len(values)):

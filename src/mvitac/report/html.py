@@ -1,7 +1,4 @@
-"""Blocks of a self-contained HTML page: the macros of ``page.html.j2``, which escape all text. No scripts, no network.
-
-The colours are those of figures, too.
-"""
+"""Blocks of a self-contained HTML page: macros of ``page.html.j2``, which escape all text. No scripts, no network."""
 
 import base64
 import io

@@ -36,8 +36,7 @@ def write_report(
 
     ``result`` is what ``probe_runs`` returned for these runs. Default: the probe.json in the first run's folder if it
     is complete (``stored_result``), else they are probed here, with logistic regression, all tasks and all controls.
-    ``pack`` is shown instead of the runs' own. ValueError if a run is not finished, or ``result`` is about other runs
-    or data.
+    ``pack`` is shown instead of the runs' own. ValueError if a run is unfinished, or ``result`` is about others.
     """
     paths = [Path(path) for path in paths]
     runs = open_runs(paths)

@@ -1,5 +1,4 @@
-"""Sections of the report: retrieval, training curves, confusion matrices. Each is a list of blocks, empty if there is
-nothing to show."""
+"""Sections of the report: retrieval, training curves, confusion matrices. Each is a list of blocks, perhaps empty."""
 
 import itertools
 import math

@@ -76,10 +76,7 @@ def _print_notes(result: dict[str, Any], records: Sequence[dict[str, Any]], file
 
 
 def classes_of(result: dict[str, Any]) -> Iterator[tuple[str, str, list[str], list[dict[str, Any]]]]:
-    """Task, modality of the headline, sources and classes (``scores.per_class``) of each task of a probe's result.
-
-    The sources are the methods, the untrained trunk and the pixels.
-    """
+    """Task, headline modality, sources (methods, untrained, pixels) and classes (``scores.per_class``) of each task."""
     for task, found in result.get("per_class", {}).items():
         methods = score_text.methods_of(result["summary"][task])
         modality = headline(result["summary"][task], methods[0], methods)[0] if methods else "touch"

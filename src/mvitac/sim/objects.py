@@ -242,7 +242,6 @@ def _geoms(thing: Thing) -> str:
 
 
 def _fingers() -> str:
-    """Return the MJCF of both fingers with their gels."""
     bar = f'type="box" size="{_numbers(FINGER_M)}" pos="{PAD_DEPTH_M + 0.003 + FINGER_M[0]} 0 0.022"'
     dome = f'size="{PAD_DEPTH_M} {PAD_HALF_M} {PAD_HALF_M}" pos="{PAD_DEPTH_M} 0 0"'
     return "\n".join(

@@ -2,8 +2,7 @@
 
 Shapes: x, y [H, W] mm on the object; u, v [H, W] the same in wavelengths, rotated so that u is along the grain.
 Each `KINDS` function maps u, v and four random tables to an unscaled height [H, W]. `Relief` then gives all kinds the same
-height distribution (unit RMS, skewness set by `asperity`), so that kinds differ only in spatial arrangement and not in
-amplitude or contrast.
+height distribution (unit RMS, skewness set by `asperity`), so that kinds differ only in spatial arrangement.
 """
 
 from collections.abc import Callable
@@ -239,10 +238,7 @@ def skew(height: F, asperity: float) -> F:
 
 
 def marks(x: F, y: F, rng: np.random.Generator, *, curl: float, extent_mm: float, count: int = 3) -> F:
-    """Draw `count` long narrow ridges or grooves of height 1 over [H, W]: kinked lines for curl 0, folds for curl 1.
-
-    Hard objects crack along lines and soft ones fold along curves. Width, number, height and sign carry no information.
-    """
+    """Draw `count` long narrow ridges or grooves of height 1 over [H, W]: kinked lines for curl 0, folds for curl 1."""
     total = np.zeros(np.broadcast_shapes(x.shape, y.shape), np.float32)
     for _ in range(count):
         angle, place, width = rng.uniform(0, np.pi), rng.uniform(-0.4, 0.4), rng.uniform(0.012, 0.022)

@@ -1,7 +1,6 @@
 """Progress bars with the time left, by tqdm, on stderr.
 
-``shown`` turns them on. ``work`` adds one from any function and any thread. Without ``shown``, e.g. if a function is
-called from Python, nothing is printed.
+``work`` adds one from any thread. Without ``shown``, e.g. if a function is called from Python, nothing is printed.
 """
 
 import sys

@@ -34,10 +34,9 @@ def exact_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
 def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     """Find rows of val and test that are nearly identical to a row of train.
 
-    Each thumbnail is reduced to its residual (``Residuals``); two rows are near-duplicates if these correlate by at least a
-    threshold. The threshold is halfway between 1 and the most similar rows of two *groups inside train*, at most ``NEAR``.
-    The fraction of train rows above it measures how similar rows of this dataset are by nature, for example frames without
-    contact.
+    Two rows are near-duplicates if their ``Residuals`` correlate by at least a threshold. It is halfway between 1 and
+    the most similar rows of two *groups inside train*, at most ``NEAR``. The fraction of train rows above it measures
+    how similar rows of this dataset are by nature, for example frames without contact.
     """
     sides = sides_of(pack.column("split").astype(str))
     groups = pack.column("group").astype(str)
@@ -72,8 +71,7 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
 class Residuals:
     """What is specific to each thumbnail.
 
-    That is its brightness minus the median thumbnail of a sensor (a gel's background, a fixed camera's scene), minus its own
-    blur (lamps that drift).
+    It is brightness minus a sensor's median thumbnail (gel background, fixed scene), minus its blur (unsteady lamps).
     """
 
     def __init__(self, one: ImageStats, sensors: np.ndarray) -> None:

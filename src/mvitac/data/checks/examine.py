@@ -47,10 +47,7 @@ class _Some(Source):
 
 
 def examine(pack: Pack, *, part: bool = False) -> list[Finding]:
-    """Run every check on ``pack``.
-
-    Of a ``part`` of a source, missing classes may be in the rest, so they are not "broken".
-    """
+    """Run every check on ``pack``. Classes that a ``part`` of a source lacks may be in the rest: not "broken"."""
     looks = look_at(pack)
     labels = [*table_checks.labels(pack), *value_checks.values(pack)]
     if part:
@@ -95,8 +92,7 @@ def examine_source(
 ) -> list[Finding]:
     """Findings about ``source``, which is read into a temporary pack of ``size`` px, to ``draw`` while it is there.
 
-    ``num`` items are read, evenly spaced; 0 = all. Damaged items are a finding; it is an error only if nothing can be
-    read.
+    ``num`` items are read, evenly spaced; 0 = all. Damaged items are a finding; an error only if nothing can be read.
     """
     some = _Some(source, num)
     with tempfile.TemporaryDirectory(prefix="mvitac-check-") as folder:

@@ -129,8 +129,7 @@ def give_aways(pack: Pack) -> Finding:
     """Find columns of numbers, and sensors, that predict a label: confounds that a control probe should use.
 
     On the labelled rows outside test, the accuracy of the most frequent class in each eighth of the values (of each
-    sensor) is compared with that of the majority class. A column that is the label itself (each value one class) or a
-    control is skipped.
+    sensor) is compared with that of the majority class. A column that is the label itself or a control is skipped.
     """
     notes = []
     other = {"id", *(task.name for task in pack.spec.tasks), *(c for used in pack.spec.controls.values() for c in used)}

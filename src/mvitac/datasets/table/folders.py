@@ -90,7 +90,6 @@ def list_videos(path: Path, names: Sequence[str], plain: str, every: int | None,
     """Return the table of the videos at ``path`` or below it, None if there are none.
 
     It has every n-th frame of a recording's first camera, and the frames of its other cameras at that time.
-
     ``names`` are those of cameras besides ``CAMERAS``, the most important first; ``plain`` is the modality of a video
     without such a name, if none are given. Rows whose cameras are more than ``tolerance`` seconds apart are left out.
     """

@@ -1,7 +1,4 @@
-"""The images that a table's rows refer to, and the background of each touch image: found, checked, and read.
-
-Those of one video (or row group, ...) are read together.
-"""
+"""The images that a table's rows refer to, and the background of each touch image: found, checked, and read."""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -94,10 +91,7 @@ def check_present(
 
 
 def check_files(table: Manifest, columns: Sequence[str], grounds: Sequence[Background]) -> dict[str, Stamp]:
-    """Check that every image file exists and is not empty, and that no row has one image in two ``columns``.
-
-    Returns the stamp of each file by its path.
-    """
+    """Return the stamp of each image file; ValueError if one is missing or empty, or twice in a row's ``columns``."""
     stamps: dict[str, Stamp] = {}
     missing: list[str] = []
     num = 0

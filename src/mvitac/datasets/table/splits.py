@@ -73,10 +73,7 @@ def _root(parent: dict[str, str], name: str) -> str:
 
 
 def check_leak(where: str, split: str, what: str, values: Sequence[str], splits: Sequence[str]) -> None:
-    """Raise ValueError if a value occurs in more than one split.
-
-    Train and unlabelled count as one split, because pre-training uses both.
-    """
+    """Raise ValueError if a value is in more than one split. Train and unlabelled are one: pre-training uses both."""
     sides: dict[str, set[str]] = defaultdict(set)
     for value, side in zip(values, splits, strict=True):
         sides[value].add("train" if side == "unlabelled" else side)

@@ -4,9 +4,8 @@
                          gelsight.mp4           touch; frame i pairs with frame i of the camera, from 0
                          video_frame/<10 digits>.jpg   gelsight_frame/<10 digits>.jpg    as extracted by the owners' script
 
-Images are read directly from the two videos (only the wanted frames, each video once) or from extracted JPEGs. The lists
-are in the owners' repository (see ``lists.py``). One pack has all three tasks; a frame that is not in a task's lists has
-label -1.
+Images are read from the two videos or from extracted JPEGs. The lists are in the owners' repository (see ``lists.py``).
+One pack has all three tasks; a frame that is not in a task's lists has label -1.
 """
 
 import itertools
@@ -236,10 +235,7 @@ def missing_report(missing: dict[str, str], num: int) -> str:
 
 
 def read_frames(place: Path, numbers: list[int], size: int, lost: dict[int, str]) -> dict[int, np.ndarray]:
-    """Return frame number -> image [size, size, 3] of one modality.
-
-    Frames that cannot be read are put in ``lost`` with the reason.
-    """
+    """Return frame number -> image [size, size, 3] of one modality; ``lost`` gets the reason for each damaged frame."""
     if place.suffix:
         why: dict[int, str] = {}
         found = dict(video.frames(place, numbers, size, lost=why))
