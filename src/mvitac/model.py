@@ -37,8 +37,7 @@ EMBED_BATCH = 64  # images that ``Model.embed`` passes through an encoder at onc
 class Model(nn.Module):
     """The networks of a method that are kept after pre-training, in eval mode, with the preprocessing of their images.
 
-    ``embed`` and ``predict`` take raw images of any kind and compute no gradients. ``forward`` takes tensors and computes
-    gradients, so the model can be trained further like any torch module.
+    ``embed`` and ``predict`` take raw images and compute no gradients. ``forward`` takes tensors, for further training.
 
     Args:
         method: The method, trained or not.
@@ -96,8 +95,7 @@ class Model(nn.Module):
     ) -> dict[str, Tensor]:
         """Features of batches of images, with gradients, for fine-tuning.
 
-        The features are those of ``embed``. After loading, the model is in eval mode: BatchNorm keeps its statistics.
-        ``train()`` changes that, as for any torch module.
+        The features are those of ``embed``. The model is in eval mode until ``train()``: BatchNorm keeps statistics.
 
         Args:
             vision: Camera images [B, C, H, W], uint8 or float in [0, 1], e.g. a batch of ``transform("vision")``.
@@ -142,8 +140,7 @@ class Model(nn.Module):
             normalize: Return the normalised input of ``trunk`` instead of the images that ``forward`` takes.
             background: For models trained on difference images: the sensor without contact, one image, to subtract.
 
-        Returns a function from an image (path, PIL image, array, tensor) to uint8 [C, stored, stored], or with ``normalize``
-        to fp32 [C, S, S]. It can be pickled.
+        Returns a function that can be pickled: image to uint8 [C, stored, stored], with ``normalize`` fp32 [C, S, S].
         """
         self.check_modality(modality)
         self._check_background(modality, background)

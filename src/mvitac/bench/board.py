@@ -142,10 +142,7 @@ def _rows(task: str, by: str, records: list[dict[str, Any]], probe: str, ask: Su
 
 
 def order_of(row: Row, names: Sequence[str]) -> str:
-    """Encoders from best to worst: '>' where the paired 95 % interval of a step excludes 0, '≈' where it does not.
-
-    Encoders that saw test rows are not in the order.
-    """
+    """Encoders that saw no test rows, best first: '>' where a step's paired 95 % interval excludes 0, '≈' where not."""
     clean = [name for name in names if name in row.cells and row.cells[name].get("leak", "") in ("", UNKNOWN)]
     found = sorted(clean, key=lambda name: -row.cells[name]["mean"])
     text = ""

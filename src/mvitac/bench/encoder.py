@@ -44,8 +44,7 @@ class About:
 def run_bench(places: Sequence[str], suite: Suite, out: Path, root: Path | None, about: About) -> Path:
     """Score an encoder on a suite and write <out>/<suite>-<name>.json; the same call continues an interrupted one.
 
-    ``places`` are its seeds: folders of runs or artifacts, or "external:...". ``root`` is the folder of real data, if
-    any.
+    ``places`` are its seeds: folders of runs or artifacts, or "external:...". ``root`` is the folder of real data.
     """
 
     def score(models: Sequence[Model], encoder: dict[str, Any]) -> dict[str, Any]:

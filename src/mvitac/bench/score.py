@@ -143,8 +143,7 @@ class Entry:
 def score_suite(entry: Entry, suite: Suite, root: Path | None, parts: Path, key: str) -> Iterator[dict[str, Any]]:
     """Score ``entry``, and yield a block for each task: "set", "task", and "not_run" or its records.
 
-    ``root`` holds the real data. Scores of finished tasks are kept in ``parts``, under ``key``, the digest of the
-    encoder.
+    ``root`` holds the real data. Scores of finished tasks are kept in ``parts``, under ``key``, the encoder's digest.
     """
     here = provenance()
     beside, lacking = trunks(suite)

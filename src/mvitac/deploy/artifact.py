@@ -6,8 +6,7 @@
                run.json            provenance: method, data, optimiser, seed, versions, commit
                README.md           the model card
 
-``load`` takes a run's folder, an artifact or an id on the Hugging Face Hub. Nothing is unpickled, every file is checked
-against its digest before it is parsed, and no file with another name is opened.
+Nothing is unpickled, each file is checked by its digest before it is parsed, and no file of another name is opened.
 """
 
 import re

@@ -68,10 +68,7 @@ class ObservationEncoder(nn.Module):
         return torch.cat([features, state.float()], dim=-1)
 
     def maps(self, observation: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The last feature map [B, D, h, w] of the trunk of each modality, for a policy that reads images by places.
-
-        Images are normalised in here, as for ``forward``, so the policy must not do it again.
-        """
+        """The last feature map [B, D, h, w] of each trunk. Images are normalised in here, as for ``forward``."""
         last: Any = {"indices": 1, "intermediates_only": True}
         return self._each(observation, lambda trunk, images: trunk.forward_intermediates(images, **last)[0])
 

@@ -39,8 +39,7 @@ NUM_RANGES, RANGE_ROWS = 8, 20
 def fit_probes(model: Model, pack: Pack) -> list[tuple[LinearProbe, dict[str, Any]]]:
     """The linear probe of every task and modality of ``pack``, and its record, as fitted and scored by ``mvitac probe``.
 
-    That of a task with values is ridge regression. A task without labelled rows in train and test has none: a probe that
-    cannot be scored is not published.
+    That of values is ridge regression. A task without labelled rows in train and test has none: it could not be scored.
     """
     modalities = [m for m in pack.spec.modalities if m in model.encoders]
     tasks = {m: scorable(pack, m) for m in (*modalities, *(["both"] if len(modalities) == 2 else []))}
@@ -153,10 +152,9 @@ def _fit_and_score(run: Path, model: Model, pack: Pack, allow_leak: bool) -> tup
 def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool = False, half: bool = False) -> Path:
     """Write the artifact of a finished run into the new folder ``out``.
 
-    It is loaded once, as a check, before it gets its name. ``pack``: data to fit the probes on (default: the data the
-    run was trained on). With ``allow_leak``, its rows or groups may be some that the run was trained on; the card says
-    LEAK beside scores. ``half``: kernels and matrices are rounded to fp16 before. Raises Busy if another process writes
-    ``out``, else ValueError.
+    It is loaded once, as a check, before it gets its name. ``pack``: data to fit probes on (default: the run's own).
+    With ``allow_leak``, its rows or groups may be some that the run was trained on; the card says LEAK beside scores.
+    ``half``: kernels and matrices are rounded to fp16. Raises Busy if another process writes ``out``, else ValueError.
     """
     with new_folder(out) as partial:
         model = load(run)

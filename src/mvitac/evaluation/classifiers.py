@@ -91,8 +91,7 @@ def fit_linear(
 ) -> tuple[Logistic, float]:
     """Fit logistic regression on standardised features; returns the classifier and C.
 
-    C is chosen on the validation rows. The final fit uses the training and validation rows together. ``num_classes`` is
-    K; 0 = up to the highest label.
+    C is chosen on the validation rows; the final fit uses them, too. ``num_classes`` is K; 0 = up to the highest label.
     """
     mean, std = x.mean(0), spread(x)
     x, x_val = (x - mean) / std, (x_val - mean) / std

@@ -1,7 +1,4 @@
-"""Controls: what a probe reaches without learned features, on the same rows.
-
-Controls are the most common class, raw pixels, the image border, the dataset's own confounds and an untrained trunk.
-"""
+"""Controls: what a probe reaches without learned features, on the same rows."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -59,10 +59,7 @@ def linear_probe(
 
 
 def _standardised(train: Tensor, new: Tensor) -> tuple[Tensor, Tensor]:
-    """Both in the mean and standard deviation of ``train``, ``new`` clipped (``BEYOND``).
-
-    A dimension that is not finite counts as constant.
-    """
+    """Both in mean and std of ``train``, ``new`` clipped (``BEYOND``); a dimension not finite is constant."""
     mean, std = train.mean(0), train.std(0)
     std = std.where(std > 1e-6 * train.abs().amax(0), 1.0)  # as ``classifiers.spread``
     least, most = train.amin(0), train.amax(0)
@@ -85,8 +82,7 @@ def _ridge(x: Tensor, y: Tensor, new: Tensor, alpha: float) -> Tensor:
 def mean_error(scores: Iterable[Sequence[float]]) -> float:
     """Geometric mean of 1 - score over tasks, each a mean over targets; an error under .01 counts as .01.
 
-    Halving the error counts alike for every task. A mean of accuracies and R2, which has no lower end, would follow the
-    worst R2.
+    Halving the error counts alike for every task. A plain mean would follow the worst R2, which has no lower end.
     """
     logs = [(1 - torch.tensor(task, dtype=torch.float64)).clamp(min=0.01).log().mean() for task in scores]
     return float(torch.stack(logs).mean().exp())

@@ -85,10 +85,7 @@ def pack_features(
     bf16: bool = False,
     advance: Callable[[int], object] = lambda num: None,
 ) -> Tensor:
-    """``Model.features`` [len(rows), D] of pack rows, computed in chunks on the model's device, on the CPU.
-
-    ``advance`` is called with each chunk's number of rows.
-    """
+    """``Model.features`` [len(rows), D] of pack rows, on the CPU, in chunks: ``advance`` gets each one's row count."""
     device = next(model.parameters()).device
     if device.type == "cpu":
         keep_freed_memory()  # else every activation is mapped again: over twice the time on a virtual machine

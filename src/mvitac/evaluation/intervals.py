@@ -1,7 +1,6 @@
 """Confidence intervals of scores, and differences between methods.
 
-Every interval is over test groups and, if there are several, the seeds: rows within a group are near-copies, groups are
-independent.
+Every interval is over test groups and, if there are several, seeds: groups are independent, their rows near-copies.
 
 Both levels' variances are added, and Student's t has the degrees of freedom of the sum (Satterthwaite 1946). This is too
 narrow when a few seeds happen to agree, so an interval is never narrower than that over seeds alone. Intervals then hold
@@ -61,8 +60,7 @@ def paired_difference(
 ) -> tuple[float, float, float, float | None]:
     """Difference in accuracy (R2 of values) between two methods on the same test groups, ``ours`` - ``theirs``.
 
-    There is one record per seed. Groups are paired. Seeds are paired if both methods have the same seeds, which share
-    batches and views.
+    There is one record per seed. Groups are paired. Equal seeds of both methods are, too: they share batches and views.
 
     Returns:
         Mean difference, lower and upper end of its 95 % interval, and the two-sided p, at least ``least_p``. p is None if
@@ -146,8 +144,7 @@ class _Variance:
 def _over_groups(correct: np.ndarray, sizes: np.ndarray) -> _Variance:
     """Variance of sum(correct) / sum(sizes) over groups, from [G] and [G].
 
-    Unbiased, with the degrees of freedom of Bell and McCaffrey (2002), if groups vary alike: G - 1 if they are equally
-    large, fewer if not.
+    Unbiased, with Bell and McCaffrey's (2002) degrees of freedom, if groups vary alike: G - 1, fewer if sizes differ.
     """
     w = sizes / sizes.sum()
     squares = float(w @ w)

@@ -140,9 +140,8 @@ def fit_probe(
 ) -> tuple[Fitted, dict[str, Any]]:
     """Fit one probe on features ``x`` of ``rows.fitted``: linear, paper, knn, and ``curve`` for controls with values.
 
-    Returns:
-        A function from features [N, D] to class probabilities [N, K] or values [N, T], and what was chosen (C or alpha of
-        ``linear``). That of ``linear`` has ``weights()``.
+    Returns a function from features [N, D] to class probabilities [N, K] or values [N, T], and what was chosen (C or
+    alpha of ``linear``). That of ``linear`` has ``weights()``.
     """
     if isinstance(task, ValueTask):
         values = pack.values(task)[rows.fitted]

@@ -72,8 +72,7 @@ class Linear:
 def fit_ridge(x: np.ndarray, y: np.ndarray, num_val: int) -> tuple[Linear, list[float]]:
     """Fit ridge regression on standardised features and targets; returns the regressor and each target's alpha.
 
-    Each alpha is the one with the least squared error on the last ``num_val`` rows, which hold groups of their own. The
-    final fit uses all rows.
+    Each alpha has the least squared error on the last ``num_val`` rows, which are whole groups; the final fit uses all.
     """
     fitted = _fit_each(x, y, num_val, make_pipeline(Scaler()))
     return fitted, [float(ridge.alpha) for ridge, _, _ in fitted.ridges]

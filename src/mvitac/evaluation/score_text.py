@@ -95,10 +95,7 @@ def methods_of(task: dict[str, Any]) -> list[str]:
 
 
 def headline(task: dict[str, Any], source: str, methods: Sequence[str]) -> tuple[str, dict[str, Any], dict[str, Any]]:
-    """The modality to show of one task's summary (both, else the best of ``source``), its score, and the controls beside it.
-
-    ``methods``: sources that are no controls.
-    """
+    """The modality to show of a task's summary (both, or the best of ``source``), its score and controls beside it."""
     have = [m for m in columns_of(task) if source in task[m]]
     modality = "both" if "both" in have else max(have, key=lambda m: task[m][source]["mean"])
     return modality, task[modality][source], beside(task, modality, methods)

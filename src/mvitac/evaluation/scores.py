@@ -1,7 +1,6 @@
 """Scores of predictions: of one probe, pooled over folds, and summarised over seeds.
 
-A record is one probe of one source on one task. ``score`` counts correct rows per test group, ``score_values`` sums errors.
-``intervals`` says how sure they are.
+A record is one probe of one source on one task. ``intervals`` says how sure scores are.
 """
 
 import math

@@ -84,8 +84,7 @@ def touch_features(
 ) -> np.ndarray:
     """``features`` of pack ``rows`` (ascending), those of touch in the statistics of each row's own sensor.
 
-    ``ProbeConfig.standardise`` says how. With colours, the features of a ``RecolouredPack``'s new sensors are the mean over
-    its ``looks``.
+    ``ProbeConfig.standardise`` says how. With colours, those of new sensors are the mean over ``RecolouredPack.looks``.
     """
     if modality != "touch" or not standardise:
         return features(model, pack, modality, rows)
@@ -150,10 +149,7 @@ class RecolouredPack(JoinedPack):
 def learn_looks(known: Pack, new: Pack, option: str) -> Looks:
     """The one sensor of ``new`` that ``known`` lacks in the colours of those that it has, as ``RecolouredPack`` shows it.
 
-    ``option`` is named by errors.
-
-    Raises:
-        ValueError: If ``new`` has not exactly one such sensor, or the colours of a sensor cannot be learned.
+    ValueError, which names ``option``, if there is not exactly one, or the colours of a sensor cannot be learned.
     """
     _check_gel(new, option)
     names = [name for name in new.sensor_names if name not in known.sensor_names]

@@ -5,8 +5,7 @@
           controls.json                  majority, untrained trunk, pixels, border, the data's own, ImageNet if asked
           result.json  table.*           the tables (``table_formats``)
 
-Finished runs are skipped and interrupted ones resumed. A run whose loss became NaN or infinite is a result too: it is
-kept as failed.json and named below the table.
+Finished runs are skipped, interrupted ones resumed. A run that diverged (failed.json) is named below the table.
 """
 
 import statistics

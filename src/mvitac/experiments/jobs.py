@@ -98,8 +98,7 @@ def do(job: Job, pack: Pack | None = None, *, quiet: bool = True) -> str:
 def do_all(work: Work, *, quiet: bool = False) -> None:
     """Run the unfinished jobs that no other process has, and print a line about each.
 
-    A job that fails is told and the others go on; ValueError at the end. Interrupted after Ctrl-C, when the run under
-    way has saved its checkpoint.
+    A job that fails is told and the others go on; ValueError at the end. Interrupted after Ctrl-C and a checkpoint.
     """
     failed = ""
     for job in [job for job in work.jobs if not job.done]:

@@ -108,10 +108,7 @@ class Plan:
         return list(found.items())
 
     def run(self, row: Row, data: DatasetConfig, seed: int, phased: bool | None = None) -> Run:
-        """The run of one row and seed; ValueError if a field does not exist or its value does not fit.
-
-        ``phased`` is that of the opened data, as for ``recipe``.
-        """
+        """The run of a row and seed, ``phased`` as for ``recipe``; ValueError if a field or its value does not fit."""
         try:
             base = with_method(recipe(row.recipe or self.recipe, data, phased), row.method)
             known = {f"method.{name}" for each in self.rows for name in vars(default(MethodConfig, each.method))}

@@ -1,7 +1,6 @@
 """Sources of live frames: cameras, video files, folders of pictures, and a simulated sensor.
 
-A ``Source`` opens, reads and closes; clocks, threads and faults are in ``live/streams.py``. Frames are uint8 RGB
-[H, W, 3].
+Clocks, threads and faults are in ``live/streams.py``. Frames are uint8 RGB [H, W, 3].
 """
 
 import importlib.util

@@ -1,10 +1,8 @@
 """Predict from the newest frames: contact, a mean answer per touch, and the age of each prediction.
 
-The background of each touch sensor (no contact) is learned from its first frames and updated slowly while nothing is
-touched; it decides *whether* there is contact. The model gets frames as they are, or minus that background if it was
-trained on difference images. Probabilities are averaged over one touch; values, such as a force, are those of the newest
-frame. Time comes from a clock passed as an argument.
-Shapes: frames uint8 RGB [H, W, 3].
+The background of each touch sensor (``contact.py``) decides *whether* there is contact. The model gets frames as they
+are, or minus that background if it was trained on difference images. Probabilities are averaged over one touch; values,
+such as a force, are those of the newest frame. Shapes: frames uint8 RGB [H, W, 3].
 """
 
 import math

@@ -43,10 +43,7 @@ class Recorder:
         self._next = float("-inf")
 
     def __call__(self, images: dict[str, np.ndarray], columns: dict[str, Any]) -> None:
-        """Keep one pair (uint8 [S, S, C] by modality) if the last one is long enough ago.
-
-        ``columns`` has at least time, contact and touch_number.
-        """
+        """Keep a pair (uint8 [S, S, C]) if it is due; ``columns`` has at least time, contact and touch_number."""
         time = columns["time"]
         if time < self._next or self.failed:
             return

@@ -94,11 +94,7 @@ class Recordings:
         config: LiveConfig = LiveConfig(),
         free: Sequence[np.ndarray] = (),
     ) -> None:
-        """``files`` are as the streams of ``Live``, and ``free`` is as there.
-
-        Raises:
-            ValueError: The engine takes others, or needs the sensor without contact, which is nowhere to be seen.
-        """
+        """As for ``Live``; ValueError if the engine takes others or needs a sensor without contact that is not seen."""
         self.engine, self.left_out, self.told = engine, 0, dict[str, int]()
         streams: Any = {
             m: [Stream(f"{m} {i}", file, clock=lambda file=file: file.time) for i, file in enumerate(several)]

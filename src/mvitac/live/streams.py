@@ -1,7 +1,6 @@
 """Streams of frames: only the newest frame counts, and every fault is reported.
 
-A ``Stream`` keeps the newest frame of its source (``live/cameras.py``), counts dropped frames and reports faults. Time
-comes from a clock passed as an argument, so tests use a fake one. Frames are uint8 RGB [H, W, 3].
+Time comes from a clock passed as an argument, so tests use a fake one. Frames are uint8 RGB [H, W, 3].
 """
 
 import threading
@@ -52,10 +51,7 @@ class Stream:
         tell: Callable[[Event], None] = lambda event: None,
         stale_after: float = 0.5,
     ) -> None:
-        """``tell`` is called with every event, in the thread that noticed it.
-
-        A frame older than ``stale_after`` seconds is no longer used.
-        """
+        """``tell`` gets every event, in the thread that noticed it. Frames are used for ``stale_after`` seconds."""
         self.name, self.origin, self.clock, self.tell = name, origin, clock, tell
         self.stale_after, self.ended, self.fault = stale_after, False, ""
         self.num_frames = self.num_dropped = self.num_damaged = 0

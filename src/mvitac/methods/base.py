@@ -51,10 +51,7 @@ class Views:
 
 
 class Method(nn.Module, ABC):
-    """A pre-training method.
-
-    It computes losses. Devices, precision, optimisers, logging and checkpoints belong to the training loop.
-    """
+    """A pre-training method. It computes losses; devices, precision, optimisers, logs, checkpoints are the loop's."""
 
     views: ClassVar[int] = 1
     """Views per image that ``forward`` needs."""

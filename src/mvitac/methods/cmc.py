@@ -7,9 +7,8 @@ that bank, drawn at random. Touch queries use the vision bank in the same way. T
     s_j   = exp(z_v . bank_t[j] / tau) / Z,      Z = N * mean of exp(...) over the first batch, fixed from then on
     L_vt  = -log( s_+ / (s_+ + K/N) ) - sum over the K drawn of log( (K/N) / (s_j + K/N) ),    mean over the batch
 
-The K rows are drawn uniformly with replacement and may include the query's own row. Both directions share one draw. After
-the step, bank rows are updated: bank[i] <- normalised .5 bank[i] + .5 z_i. There is no momentum encoder, and one view per
-image.
+The K rows are drawn uniformly with replacement and may include the query's own. Both directions share one draw. After
+the step, bank rows are updated: bank[i] <- normalised .5 bank[i] + .5 z_i. An image has one view; no momentum encoder.
 Sources: arXiv:1906.05849 (eq. 8 - 12); https://github.com/HobbitLong/CMC (NCE/);
 https://github.com/fredfyyang/Touch-and-Go (train_CMC_touch.py: K 16384, tau .07, bank momentum .5, 128-d).
 

@@ -1,7 +1,6 @@
 """SimCLR (Chen et al., ICML 2020, arXiv:2002.05709), for each modality separately: NT-Xent between two views of an image.
 
-Each of the 2B views must identify the other view of its image among the 2B - 1 remaining ones. Vision and touch are never
-compared.
+Each of the 2B views must identify the other view of its image among the 2B - 1 remaining ones.
 """
 
 from dataclasses import dataclass

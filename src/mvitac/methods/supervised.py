@@ -1,7 +1,5 @@
 """The supervised reference: one trunk per modality, concatenated features, one linear layer per task, trained end to end.
 
-A task asks for a class (cross-entropy) or for values (smooth L1 on standardised values).
-
 This is how the paper describes its ResNet-18 rows (appendix C). It also shows how much of a task the same network can learn
 from labels: its own heads are scored, and its frozen trunks are probed like those of any other method.
 

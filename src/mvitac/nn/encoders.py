@@ -170,9 +170,8 @@ class Encoders:
 def build_trunk(config: EncoderConfig, channels: int, frames: int = 1) -> nn.Module:
     """Create a trunk that maps images [B, ``channels``, H, W] to pooled features [B, D]; ``trunk.num_features`` is D.
 
-    ``EncoderConfig.stem`` says how the first convolution of a pretrained trunk starts if there are not three channels.
-    The channels are those of all ``frames`` of a window together. ValueError if the requested weights are not
-    available: there is no silent fallback to random weights.
+    The channels are those of all ``frames`` of a window together. ValueError if the requested weights are missing:
+    there is no silent fallback to random weights.
     """
     single = frames == 1 or config.temporal == "stack"
     channels = channels if single else channels // frames
@@ -262,8 +261,7 @@ def timm_trunk(
 ) -> nn.Module:
     """A copy of an encoder from ``build_trunk`` as timm would have made it, with a ``pretrained_cfg`` of these values.
 
-    ``input_size`` is channels, height and width; ``mean`` and ``std`` are of each channel. ValueError if it is no
-    single timm model.
+    ``input_size``: channels, height, width; ``mean``, ``std``: by channel. ValueError if it is no single timm model.
     """
     if not hasattr(encoder, "forward_features"):
         raise ValueError(f"this encoder is no single timm model but a {type(encoder).__name__}: use model.encoders")

@@ -6,9 +6,7 @@ sum of matrix products, one for each row of the kernel, over those places of the
 slices of the tensors as they lie in memory; nothing is copied.
 
 The weight gradient of a depthwise convolution takes oneDNN up to sixty times as long as its forward pass. Here it is one
-sum of products for each place of the kernel.
-
-Both are the same sums in another order, so equal to the convolution to rounding (tests/nn/test_layers.py).
+sum of products for each place of the kernel. Both equal the convolution to rounding (tests/nn/test_layers.py).
 """
 
 from functools import lru_cache

@@ -1,7 +1,6 @@
 """Masked Vision Transformers: random numbers of each row, encoding a part of the patches, predicting the others.
 
-Shapes: B images, F prefix tokens (class, registers), N patches of a grid [rows, columns], K of them visible, T predicted,
-D features.
+Shapes: B images, F prefix tokens (class, registers), N patches in rows and columns, K visible, T predicted, D features.
 """
 
 from dataclasses import dataclass
@@ -159,8 +158,7 @@ class Predictor(nn.Module):
     ) -> Float[Tensor, "B M T O"]:
         """Predict each of M sets of ``hidden`` patches on its own, from the visible tokens ``seen``.
 
-        ``live`` says which of ``hidden`` count, if the visible tokens say which of them do. No token attends to the
-        others.
+        ``live`` says which of ``hidden`` count, if ``seen`` says it of the visible ones. No token attends to others.
         """
         positions = sin_cos_positions(*seen.grid, self.mask_token.shape[3], hidden.device)
         front = seen.values.shape[1] - seen.at.shape[1]

@@ -18,11 +18,7 @@ SHARE = 0.4  # share of the free GPU memory that a copy of the pack may take
 
 
 class ImageLoader:
-    """Returns images of a pack on a device.
-
-    On a GPU the whole pack is kept in GPU memory if it fits (JPEGs are decoded). Otherwise images are copied through pinned
-    memory.
-    """
+    """Images of a pack on a device. A GPU keeps the whole pack, decoded, if it fits, or gets parts by pinned memory."""
 
     def __init__(self, pack: Pack, device: torch.device) -> None:
         self.pack, self.device, self.resident = pack, device, {}

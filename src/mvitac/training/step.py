@@ -24,11 +24,7 @@ Chunk = Callable[[], Views]
 
 
 class Step:
-    """Takes one optimiser step of ``method``, which is on ``device``, when called.
-
-    Raises:
-        ValueError: If the method or the trunk does not support the settings of ``run``.
-    """
+    """Takes one optimiser step of ``method``, on ``device``; ValueError if it or its trunk does not support ``run``."""
 
     def __init__(self, run: Run, method: Method, device: torch.device, world: World | None = None) -> None:
         self.method, self.device, self.world, self.bf16 = method, device, world or World(), run.bf16
@@ -115,10 +111,7 @@ class Step:
 
 
 def build_optimiser(config: Optim, method: Method, encoders: Encoders) -> torch.optim.Optimizer:
-    """Create the optimiser of the trainable parameters (momentum copies have none). Uses a fused kernel if available.
-
-    Its groups are those of equal weight decay and equal share of the learning rate (lr_scale).
-    """
+    """The optimiser of the trainable parameters, in groups of equal weight decay and share of the rate (lr_scale)."""
     parameters = [p for p in method.parameters() if p.requires_grad]
     fused = all(p.device.type in ("cpu", "cuda") and p.is_floating_point() for p in parameters)
     scales = _scales(method, encoders)

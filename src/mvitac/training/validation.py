@@ -114,10 +114,7 @@ def _validate(model: Model, pack: Pack, run: Run, locked: Mapping[str, Tensor]) 
 def _linear(
     pack: Pack, train_rows: np.ndarray, rows: np.ndarray, train_features: dict[str, Tensor], z: dict[str, Tensor]
 ) -> Cells:
-    """Errors by group on ``rows``, with features ``z``, of a linear probe of each task and modality, and of both together.
-
-    It is fitted on ``train_rows``, with ``train_features``.
-    """
+    """Errors by group on ``rows``, with features ``z``, of linear probes of each task by each modality and by both."""
     if len(z) > 1:
         train_features, z = (found | {"both": torch.cat(list(found.values()), dim=1)} for found in (train_features, z))
     names = np.unique(pack.column("group").astype(str), return_inverse=True)[1]

@@ -27,10 +27,7 @@ TOLERANCE = 1e-3  # by which floats may lie outside [0, 1], as rounding and resi
 
 @dataclass(frozen=True)
 class Preprocess:
-    """The preprocessing of ``Model.embed`` for one image, e.g. as the transform of a dataset. It can be pickled.
-
-    Made by ``Model.transform``.
-    """
+    """The preprocessing of ``Model.embed`` for one image, made by ``Model.transform``. It can be pickled."""
 
     modality: str
     channels: int
@@ -164,10 +161,7 @@ def resized(images: Tensor, side: int) -> Tensor:
 
 
 def encoder_input(images: Tensor, size: int, mean_std: MeanStd = IMAGENET) -> Tensor:
-    """Images [B, C, H, W], uint8 or float in [0, 1], as normalised fp32 [B, C, size, size].
-
-    Gradients flow to float images.
-    """
+    """Images [B, C, H, W], uint8 or float in [0, 1], as normalised fp32 [B, C, size, size]; floats get gradients."""
     if images.dtype == torch.uint8:
         return plain_view(images, size, mean_std)
     return normalise(resized(images.float(), size), mean_std)

@@ -93,9 +93,8 @@ def randomised(network: nn.Module, seed: int) -> nn.Module:
 class ExternalModel(Model):
     """A frozen encoder with the interface of ``Model`` that probes, features and ``embed`` use.
 
-    There is no run, no shared space and no own head. Images of several sensors are encoded one by one and their features
-    joined. Where it needs more frames than a row has, the oldest one is repeated. ``text`` named the encoder; ``parts``:
-    modality -> the opened one, bound to its images; ``notes``: what the data lacks that it wants.
+    There is no run, no shared space and no own head. ``text`` named the encoder; ``parts``: modality -> the opened one,
+    bound to its images; ``notes``: what the data lacks that it wants.
     """
 
     def __init__(
@@ -147,12 +146,9 @@ class ExternalModel(Model):
         return self.part.loaded.trained_on
 
     def on(self, pack: Pack) -> "tuple[ExternalModel, Pack]":
-        """This model and ``pack``, for each other.
+        """This model and ``pack``, for each other; ValueError if the data has no image that this model reads.
 
         The pack gets windows if an encoder wants several frames, the pack can order its frames, and it has no windows yet.
-
-        Raises:
-            ValueError: If the data has no image that this model reads.
         """
         modalities = tuple(m for m in self.parts if m in pack.spec.modalities)
         if not modalities:
