@@ -216,8 +216,7 @@ def test_imagenet_is_a_control_where_its_weights_are(
     value = read_result(run_bench([RANDOM.format(5)], toys, tmp_path / "with", root, About()))
     found = {(r["modality"], r["probe"], r["seed"]) for r in value["blocks"][0]["records"] if r["source"] == "imagenet"}
     assert found == {(m, p, None) for m in ("touch", "both") for p in ("linear", "30 % of labels")}
-    assert problems(value) == []
-    assert "imagenet" in gather({value["encoder"]["name"]: value}).controls
+    assert problems(value) == [] and "imagenet" in gather({value["encoder"]["name"]: value}).controls
     drop(value, source="imagenet", modality="both")
     assert problems(value)[0] == "stripes, pattern: lacks imagenet, both, 30 % of labels, None"
 

@@ -129,8 +129,7 @@ def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
     weights = tmp_path / "demo" / "seed1" / "model.safetensors"
     before = weights.stat().st_mtime_ns
     monkeypatch.setattr("mvitac.experiments.demo.probe_runs", None)  # calling it would raise
-    assert main(command) == 0
-    assert weights.stat().st_mtime_ns == before
+    assert main(command) == 0 and weights.stat().st_mtime_ns == before
     assert json.loads((tmp_path / "demo" / "summary.json").read_text()) == summary
 
 

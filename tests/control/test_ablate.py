@@ -111,8 +111,7 @@ def test_each_replacement_gives_what_it_says(pack: Pack) -> None:
     force = episodes.actions[:, 0].reshape(-1, STEPS)
     kinds = ("", "mean frame", "another episode", "10 frames ago", "noise")
     felt = {k: act(needs, episodes, "touch" * bool(k), k)[0][:, 0].reshape(-1, STEPS) for k in kinds}
-    assert np.abs(felt[""] - force).max() < 1.5
-    assert np.allclose(felt["mean frame"], force.mean(), atol=1.5)
+    assert np.abs(felt[""] - force).max() < 1.5 and np.allclose(felt["mean frame"], force.mean(), atol=1.5)
     assert np.abs(felt["another episode"] - np.roll(force, -1, axis=0)).max() < 1.5
     assert np.abs(felt["10 frames ago"][:, 10:] - force[:, :-10]).max() < 1.5
     assert np.abs(felt["10 frames ago"][:, :11] - force[:, :1]).max() < 1.5

@@ -238,8 +238,7 @@ def test_parts_are_made_again_from_the_first_whose_files_have_changed(pack: Pack
     partial = almost_finished(tmp_path / "p", Stamped())
     source = Stamped(changed=(40, 119))
     build(source, tmp_path / "p", size=32, quiet=True)
-    assert source.seen == list(range(32, 120))
-    assert not partial.exists()
+    assert source.seen == list(range(32, 120)) and not partial.exists()
     assert contents(tmp_path / "p") == contents(pack.path), "no pack tells when its files were written"
 
 

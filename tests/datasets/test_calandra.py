@@ -255,8 +255,7 @@ def test_the_authors_protocol_is_named_too(leaking: Path, tmp_path: Path) -> Non
     pack = leaking_pack(leaking, tmp_path / "p", ask=("during", "authors"))
     task = pack.spec.tasks[1]
     rows = split_rows(pack, task)
-    assert "after" in task.name
-    assert set(pack.column("phase")[rows.train]) == set(PHASES)
+    assert "after" in task.name and set(pack.column("phase")[rows.train]) == set(PHASES)
     assert set(pack.column("phase")[rows.val]) == set(pack.column("phase")[rows.test]) == {"during"}
 
 
@@ -268,8 +267,7 @@ def test_labels_are_only_of_rows_the_task_is_about(tmp_path: Path) -> None:
 
     pack = build(GraspsConfig(num=24, size=16).source(), tmp_path / "p", size=16, quiet=True)
     about = pack.column("phase") == "during"
-    assert (pack.column("label_success") >= 0).all()
-    assert np.array_equal(pack.labels("success") >= 0, about)
+    assert (pack.column("label_success") >= 0).all() and np.array_equal(pack.labels("success") >= 0, about)
     run = smoke(pack)
     rows = pack.rows("train")
     run = replace(run, augment=replace(run.augment, size=16))

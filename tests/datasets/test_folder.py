@@ -131,8 +131,7 @@ def test_paths_are_relative_to_the_manifest_and_the_fingerprint_to_nothing(tmp_p
     for place in ("here/set", "there/below/set"):
         write(make_rows(tmp_path / place), tmp_path / place / "manifest.csv")
         prints.append(config(tmp_path / place).source().fingerprint())
-    assert prints[0] == prints[1]
-    assert str(tmp_path) not in json.dumps(prints[0])
+    assert prints[0] == prints[1] and str(tmp_path) not in json.dumps(prints[0])
     assert config(tmp_path / place, split_seed=1).source().fingerprint() != prints[0]
     before = config(tmp_path / place).place()
     Image.new("RGB", (64, 64), (1, 2, 3)).save(tmp_path / place / "vision" / "03.png")
@@ -224,8 +223,7 @@ def test_equal_numbers_and_truths_are_equal(cell: str, wanted: str) -> None:
 def test_unlabelled_rows_are_kept_for_pre_training_only(tmp_path: Path, rows: Table) -> None:
     pack = packed(config(write(rows, tmp_path / "m.csv"), label_only=("seq<=1",)), tmp_path / "pack")
     labels = pack.column("label_material")
-    assert pack.num == NUM
-    assert (labels[pack.column("seq").astype(int) == 2] == -1).all()
+    assert pack.num == NUM and (labels[pack.column("seq").astype(int) == 2] == -1).all()
     assert set(pack.column("split")[pack.column("group") == "007"]) == {"unlabelled"}  # no label at all
     assert (labels[pack.rows("unlabelled")] == -1).all()
 
@@ -396,8 +394,7 @@ def test_a_damaged_image_is_named_or_counted(tmp_path: Path, rows: Table, kind: 
     damage(tmp_path / "left" / "04.png")
     with pytest.raises(ValueError, match=rf"first row 5: .*04\.png .*{says}") as caught:
         build(source, tmp_path / "pack", size=16, quiet=True)
-    assert "\n" not in str(caught.value)
-    assert not (tmp_path / "pack").exists()
+    assert "\n" not in str(caught.value) and not (tmp_path / "pack").exists()
     pack = build(source, tmp_path / "pack", size=16, quiet=True, max_damaged=0.1)
     assert pack.num == NUM - 1 and pack.meta["damaged"][0][0] == "row 5"
 
@@ -504,8 +501,7 @@ def test_bad_manifests_are_named_before_anything_is_written(tmp_path: Path, rows
     before = set(cache_dir().glob("packs/*"))
     with pytest.raises(ValueError, match=says) as caught:
         config(file, **options).open(quiet=True)
-    assert "\n" not in str(caught.value)
-    assert set(cache_dir().glob("packs/*")) == before
+    assert "\n" not in str(caught.value) and set(cache_dir().glob("packs/*")) == before
 
 
 BAD_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
@@ -567,8 +563,7 @@ def test_commands_say_what_a_group_is(tmp_path: Path, rows: Table, capsys: pytes
     assert main([*words, "--out", str(tmp_path / "grouped"), "--group", "object"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "groups: 8, one per object, of 3 rows each. Each is one touch group, too" in shown
-    assert "no --group" not in shown
-    assert main([*words, "--out", str(tmp_path / "forgotten")]) == 0
+    assert "no --group" not in shown and main([*words, "--out", str(tmp_path / "forgotten")]) == 0
     for packed_now in (True, False):
         shown = " ".join(capsys.readouterr().out.split())
         assert "groups: 24, one per row, of 1 row each. A split takes whole groups, and intervals are over" in shown

@@ -231,8 +231,7 @@ def test_physiclear_labels_are_read_not_run(packs: dict[str, Pack], clones: Path
         thing, video = pack.column("video")[i].rsplit("_", 1)
         k = 12 if thing == "stranger" else int(thing.split("_")[1])
         frame = int(pack.column("frame")[i])
-        assert 12 <= frame <= 24
-        assert abs(level(pack.images["touch"][i]) - shade(frame, k + int(video))) < 6
+        assert 12 <= frame <= 24 and abs(level(pack.images["touch"][i]) - shade(frame, k + int(video))) < 6
         expected = [-1] * 4 if k == 12 else [(k + 1) % 2, k % 3, (k + 1) % 3, (k + 2) % 3]
         assert [pack.column(f"label_{task.name}")[i] for task in pack.spec.tasks] == expected
     assert set(pack.column("split")[pack.column("group") == "stranger"]) == {"unlabelled"}

@@ -90,8 +90,7 @@ def test_every_video_is_decoded_once(films: Path, tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(rows_module, "MAX_TOGETHER", 5)  # what is too much for the memory is read in turns
     asked.clear()
     packed(table(films / "once.csv", film_rows()), tmp_path / "q", labels=("label",), group="take")
-    assert len(asked) == 3 * 8
-    assert Pack(tmp_path / "q").digest == Pack(tmp_path / "p").digest
+    assert len(asked) == 3 * 8 and Pack(tmp_path / "q").digest == Pack(tmp_path / "p").digest
     monkeypatch.setattr(rows_module, "MAX_TOGETHER_BYTES", 4 * 16 * 16 * 6)  # four rows of two images
     source = FolderConfig(path=films / "once.csv", size=16, labels=("label",), group="take").source()
     assert list(source.samples_per_item()) == [4, 4, 4] * 4

@@ -128,8 +128,7 @@ def test_a_frame_that_comes_while_others_are_taken_is_used_once(engine: Engine) 
 
     stream.pump()
     stream.newest = meanwhile  # type: ignore[method-assign]
-    assert world.live.tick() and not world.live.tick()
-    assert world.live.num_predictions == before + 1
+    assert world.live.tick() and not world.live.tick() and world.live.num_predictions == before + 1
 
 
 def test_a_background_is_forgotten_between_frames(engine: Engine) -> None:
@@ -149,8 +148,7 @@ def test_minutes_of_faults(engine: Engine) -> None:
     num, seconds = (int(os.environ["MVITAC_MINUTES"]), 60) if "MVITAC_MINUTES" in os.environ else (10, 30)
     world, made, memory = faulty(engine, num, seconds)
     traced, resident = ([at[i] for at in memory[2:]] for i in (0, 1))
-    assert len(set(made)) == 10
-    assert world.live.num_touches > num * (seconds - 15) / 3
+    assert len(set(made)) == 10 and world.live.num_touches > num * (seconds - 15) / 3
     assert max(traced) - min(traced) < 64_000, memory
     assert max(resident) < 1.05 * resident[0], memory
 
@@ -168,8 +166,7 @@ def test_a_touch_while_calibrating_is_named(free: int) -> None:
     clock.now = 3.0
     for _ in range(10):
         contact(rig.read())
-    assert contact.background is not None and not contact.uneasy
-    assert contact(rig.read()) is False
+    assert contact.background is not None and not contact.uneasy and contact(rig.read()) is False
     clock.now = 4.5
     assert contact(rig.read()) is True
 

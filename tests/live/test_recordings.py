@@ -190,8 +190,7 @@ def test_predict_command(
         (str(empty),): "holds no pictures",
     }
     for words, says in wrong.items():
-        assert main([*command, *words, "--out", str(out)]) == 2
-        assert says in capsys.readouterr().err
+        assert main([*command, *words, "--out", str(out)]) == 2 and says in capsys.readouterr().err
 
 
 def test_a_crop_is_what_the_model_sees(engine: Engine, films: dict[str, Path], tmp_path: Path) -> None:

@@ -82,8 +82,7 @@ def test_forces_balance():
     during, after = moments[1], moments[2]
     for touch in (during.left, during.right):
         assert touch.normal_n == pytest.approx(5.0, rel=0.1)
-    assert during.left.normal_n == pytest.approx(during.right.normal_n, rel=0.1)
-    assert after.success == 1
+    assert during.left.normal_n == pytest.approx(during.right.normal_n, rel=0.1) and after.success == 1
     carried = after.left.shear_n[1] + after.right.shear_n[1]  # picture rows run downwards
     assert carried == pytest.approx(some.mass * 9.81, rel=0.1)
     assert after.rise_m == pytest.approx(0.05, abs=0.006)
@@ -121,8 +120,7 @@ def test_peaks_and_pits_differ_in_the_sign_of_their_skewness_and_nothing_else():
     for draw in range(12):
         patch = dataclasses.replace(skin.draw_patch(np.random.default_rng(draw)), peaks=True)
         peaks, pits = patch.relief_mm(points), dataclasses.replace(patch, peaks=False).relief_mm(points)
-        assert np.array_equal(peaks, -pits)
-        assert np.mean((peaks - peaks.mean()) ** 3) > 0.2 * peaks.std() ** 3
+        assert np.array_equal(peaks, -pits) and np.mean((peaks - peaks.mean()) ** 3) > 0.2 * peaks.std() ** 3
 
 
 def test_the_camera_does_not_see_what_the_fingers_slide_on(monkeypatch):
@@ -140,5 +138,4 @@ def test_a_lost_solver_is_a_failed_grasp_and_leaves_no_nan():
     bench = physics.Bench(thing("can"))
     bench.model.opt.gravity[2] = -1e6
     last = list(bench.moments(plan()))[-1]
-    assert last.unstable == 1 and last.success == 0
-    assert np.isfinite(bench.data.qpos).all()
+    assert last.unstable == 1 and last.success == 0 and np.isfinite(bench.data.qpos).all()

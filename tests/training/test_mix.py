@@ -71,8 +71,7 @@ def test_stopped_and_resumed_equals_straight(parts: dict[str, str], tmp_path: Pa
     out = train_twice(run, tmp_path, cut=5)
     values = next(line["eval"] for line in reversed(log_of(tmp_path / "straight")) if "eval" in line)
     shown = {"a vision/linear pattern", "a touch/linear a/bright", "a vision->touch R@5", "gel touch/linear pattern"}
-    assert shown <= values.keys()
-    assert not any(name.startswith("gel") and "vision" in name for name in values)
+    assert shown <= values.keys() and not any(name.startswith("gel") and "vision" in name for name in values)
     other = mix_run(f"{parts['a']}:1", f"{parts['gel']}:3", steps=8)
     with pytest.raises(ValueError, match="holds a different run"):
         train(other, out, resume=True, quiet=True)
@@ -196,5 +195,4 @@ def test_a_run_on_a_mix_is_probed_by_task(parts: dict[str, str], tmp_path: Path)
     assert {r["task"] for r in result["records"] if r["source"] == "noise only"} == {"a/bright"}
     assert {r["modality"] for r in records if r["task"] == "gel/bright"} == {"touch"}
     assert {(r["modality"], r["num_test"]) for r in records if r["task"] == "pattern"} >= {("both", num[0])}
-    assert not result["leaks"]
-    assert main(["report", str(out), "--out", str(tmp_path / "report.html")]) == 0
+    assert not result["leaks"] and main(["report", str(out), "--out", str(tmp_path / "report.html")]) == 0

@@ -150,8 +150,7 @@ def check(source: Presses, tmp_path: Path) -> dict[str, Finding]:
 def test_the_healthy_one_is_healthy(kind: str, tmp_path: Path) -> None:
     findings = check(Presses(kind), tmp_path)
     assert {f.item: f.evidence for f in findings.values() if f.verdict != "ok"} == {}
-    assert exit_code(findings.values()) == 0
-    assert "best" in findings["time offset between streams"].evidence
+    assert exit_code(findings.values()) == 0 and "best" in findings["time offset between streams"].evidence
 
 
 FAULTS = {
@@ -237,8 +236,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         build(Presses(fault), path, size=SIDE, quiet=True)
         file = tmp_path / (fault or "fine")
         codes[fault] = main(["data", "check", str(path), "--json", f"{file}.json", "--sheet", f"{file}.png"])
-    assert codes == {"": 0, "constant": 1, "copies": 2}
-    assert not capsys.readouterr().err
+    assert codes == {"": 0, "constant": 1, "copies": 2} and not capsys.readouterr().err
     told = json.loads((tmp_path / "constant.json").read_text())
     assert told["exit_code"] == 1
     found = next(f for f in told["findings"] if f["item"] == "constant frames")
@@ -262,15 +260,13 @@ def test_the_command_on_a_source(tmp_path: Path, capsys: pytest.CaptureFixture[s
     (tmp_path / "m.csv").write_text("\n".join(rows))
     command = ["data", "check", "--data", "folder", "--path", str(tmp_path / "m.csv"), "--labels", "label"]
     command += ["--quiet", "--workers", "1"]
-    assert main(command) == 2
-    assert "row 6:" in capsys.readouterr().out
+    assert main(command) == 2 and "row 6:" in capsys.readouterr().out
     (tmp_path / "m.csv").write_text("\n".join([*rows, "30.png,a,g0,train"]))  # g0 is in test
     assert main([*command, "--json", str(tmp_path / "leak.json")]) == 2
     told = {f["item"]: f for f in json.loads((tmp_path / "leak.json").read_text())["findings"]}
     assert told["groups across splits"]["verdict"] == told["unreadable items"]["verdict"] == "broken"
     assert "group (group): 1 of 20 in more than one split, e.g. 'g0'" in told["groups across splits"]["evidence"]
-    assert main(["data", "check", str(tmp_path / "nothing")]) == 2
-    assert "no pack at" in capsys.readouterr().err
+    assert main(["data", "check", str(tmp_path / "nothing")]) == 2 and "no pack at" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("late", [-3, 0, 2])
@@ -286,8 +282,7 @@ def test_the_lag_is_touch_after_vision(late: int, tmp_path: Path) -> None:
 
     pack = build(altered(Presses(), flash), tmp_path / "p", size=SIDE, quiet=True)
     curves = motion_correlations(pack, look_at(pack), pack.column("seq").astype(float))
-    assert curves.mean(0).argmax() - MAX_LAG == late
-    assert len(curves) == NUM_OBJECTS
+    assert curves.mean(0).argmax() - MAX_LAG == late and len(curves) == NUM_OBJECTS
 
 
 def test_what_cannot_be_checked_is_said_and_costs_nothing(tmp_path: Path) -> None:
