@@ -214,7 +214,7 @@ def test_two_ways_to_type_a_name_are_one(tmp_path: Path, rows: Table) -> None:
     assert pack.digest == other.digest
 
 
-@pytest.mark.parametrize(("cell", "wanted"), [("0.10", "0.1"), ("1e1", "10.0"), ("True", "true"), ("2", "2")])
+@pytest.mark.parametrize(("cell", "wanted"), [("0.10", "0.1"), ("10.0", "10"), ("True", "true"), ("2", "2")])
 def test_equal_numbers_and_truths_are_equal(cell: str, wanted: str) -> None:
     assert Condition.parse(f"a={wanted}").holds({"a": cell}) and not Condition.parse(f"a!={wanted}").holds({"a": cell})
     assert Condition.parse("a!=07").holds({"a": "7"})  # names of objects

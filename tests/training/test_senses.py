@@ -121,7 +121,7 @@ def test_precision_is_measured_on_what_a_step_computes(pack: Pack, monkeypatch: 
     built: list[str] = []
     monkeypatch.setattr(setup, "build_trunk", lambda config, *_: (built.append(config.trunk), made)[1])
     setup._trial_pass(run, pack, torch.device("cpu"))()
-    assert built == [run.encoder.touch.trunk] and seen == [(32, 3, 48, 48)]
+    assert built == [run.encoder.touch.trunk] and seen == [(32, 3, run.augment.size, run.augment.size)]
 
 
 def test_features_of_all_stages() -> None:
