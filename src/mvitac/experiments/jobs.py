@@ -53,7 +53,7 @@ class Job:
         if self.failure or not path.exists():
             return bool(self.failure)
         found = read_json(path, "a run's scores")  # which may have been copied from another run
-        return (found["asked"], found["of"]) == (self.asked, self.run.digest())
+        return (found["asked"], found.get("of")) == (self.asked, self.run.digest())
 
     def seconds(self) -> float:
         """Seconds of training."""
