@@ -108,9 +108,12 @@ def test_clocks_that_pair_nothing(tmp_path: Path, gel: list[float], front: list[
             config.source()
     else:
         assert f"1 messages of {GEL} have the stamp of another" in config.manifest().notes[0]
-        (tmp_path / "bag" / "metadata.yaml").unlink()
-        with pytest.raises(ValueError, match=r"bag\.mcap has no metadata\.yaml"):
-            RosbagConfig(path=tmp_path, touch=(GEL,)).source()
+        killed = tmp_path / "killed.bag.active"
+        for file in (killed, tmp_path / "bag" / "bag.mcap"):
+            killed.touch() if file == killed else killed.unlink()
+            with pytest.raises(ValueError, match=f"{file.name} was not closed"):
+                RosbagConfig(path=tmp_path, touch=(GEL,)).source()
+            (tmp_path / "bag" / "metadata.yaml").unlink(missing_ok=True)
 
 
 def test_a_short_image_is_named(tmp_path: Path) -> None:

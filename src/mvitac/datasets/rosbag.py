@@ -50,9 +50,9 @@ class RosbagConfig(RecordedConfig):
         path, bags = self.path, [self.path] if self.reads(self.path) else []
         if not bags and path.is_dir():
             bags = sorted([*(file.parent for file in path.rglob("metadata.yaml")), *path.rglob("*.bag")])
-            for file in sorted([*path.rglob("*.mcap"), *path.rglob("*.db3")]):
+            for file in sorted([*path.rglob("*.mcap"), *path.rglob("*.db3"), *path.rglob("*.bag.active")]):
                 if file.parent not in bags:
-                    raise ValueError(f"{file} has no metadata.yaml (was its recording killed?): ros2 bag reindex")
+                    raise ValueError(f"{file} was not closed (no metadata.yaml): ros2 bag reindex, or rosbag reindex")
         if not bags:
             raise ValueError(f"{path} is no bag and holds none: give a folder with metadata.yaml, a .bag, or several")
         cameras = [topic for topic in (*self.touch, self.vision) if topic]

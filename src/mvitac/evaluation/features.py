@@ -17,6 +17,7 @@ from mvitac.nn.folded import folded
 from mvitac.system.files import cache_dir, digest, write_atomic
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.progress import work
+from mvitac.system.threads import in_threads
 
 
 def sample(rows: np.ndarray, num: int, rng: np.random.Generator | None = None) -> np.ndarray:
@@ -99,11 +100,14 @@ def pack_features(
         expected, faster = read(model, rows[:2]), _folded(model, modality)
         if (read(faster, rows[:2]) - expected).abs().max() <= 1e-4 * expected.abs().max():
             model = faster
-    chunks = []
-    for chunk in np.array_split(rows, max(1, len(rows) // size)):
-        chunks.append(read(model, chunk))
+
+    def read_chunk(chunk: np.ndarray) -> Tensor:
+        values = read(model, chunk)
         advance(len(chunk))
-    return torch.cat(chunks)
+        return values
+
+    chunks = np.array_split(rows, max(1, len(rows) // size))
+    return torch.cat(in_threads(read_chunk, chunks) if device.type == "cpu" else list(map(read_chunk, chunks)))
 
 
 def _folded(model: Model, modality: str) -> Model:
