@@ -286,6 +286,18 @@ def all_right(value: dict[str, Any]) -> None:
     record["sums"]["correct"] = record["sums"]["n"]
 
 
+def no_mean(value: dict[str, Any]) -> None:
+    """One answer for all rows, which is never wrong."""
+    sums = next(r["sums"] for r in value["blocks"][1]["records"] if r["source"] == "mean")
+    sums |= {name: [[0.0 for _ in each] for each in sums[name]] for name in ("error", "squared_error")}
+
+
+def own_control(value: dict[str, Any]) -> None:
+    """The suite asks for a column of the data."""
+    value["suite"]["sets"][0]["forms"][0]["data"] = {"name": "folder", "controls": ["width = w,h"]}
+    value["suite_digest"] = suite_of(value).digest()
+
+
 def not_run(block: dict[str, Any], why: str = "no time") -> None:
     for key in block.keys() - {"set", "task"}:
         del block[key]
@@ -323,11 +335,14 @@ FORGED: dict[str, tuple[Change, str]] = {
     "no imagenet": (lambda value: value["blocks"][1].pop("notes"), "lacks imagenet, touch, linear, None"),
     "a truth for a count": (put(*RECORDS, 0, "sums", "correct", 0, value=True), "its sums are no numbers"),
     "all guesses right": (all_right, "one answer is right for all rows"),
+    "no error of a mean": (no_mean, "its errors are smaller than those of any one answer"),
+    "control of the data": (own_control, "lacks width, none, linear, None"),
+    "note": (put("blocks", 0, "notes", value=[5]), "a leak mark, a note, a group or what groups are is no text"),
     "clipped": (put(*VALUES, "clipped", value=[9, 4]), "9 of its 4 features were clipped"),
     "excuse": (put("blocks", 0, "left_out", value={"vision": NO_VISION}), NO_VISION),
     "excuse of a lost encoder": (no_touch, f"stripes, light: {NO_TOUCH}"),
-    "leak": (put("blocks", 0, "leaks", value=[-1]), "a leak mark, a group or what groups are is no text"),
-    "group by": (lambda value: value["blocks"][0].pop("group_by"), "a leak mark, a group or what groups are"),
+    "leak": (put("blocks", 0, "leaks", value=[-1]), "a leak mark, a note, a group or what"),
+    "group by": (lambda value: value["blocks"][0].pop("group_by"), "a leak mark, a note, a group or what"),
     "list for a number": (put("encoder", "images_seen", value=[]), "a.json is damaged"),
     "nothing": (lambda value: [not_run(block) for block in value["blocks"]], "was run on no task"),
     "twice": (put(*RECORDS, value=lambda records: [*records, records[0]]), "is there twice"),
@@ -357,9 +372,11 @@ def test_forgery_is_refused(kind: str, results: list[Path], tmp_path: Path, caps
 
 
 def more_spread(value: dict[str, Any]) -> None:
-    """A larger R2 for all."""
+    """A larger R2 for all but the mean."""
     for record in value["blocks"][1]["records"]:
-        record["sums"]["squared_value"] = [[10 * x for x in each] for each in record["sums"]["squared_value"]]
+        for name in ("value", "error") if record["source"] == "mean" else ("value",):
+            for sums, by in ((name, 2), (f"squared_{name}", 4)):
+                record["sums"][sums] = [[by * x for x in each] for each in record["sums"][sums]]
 
 
 def test_what_a_result_says_of_rows_and_of_leaks_is_compared(

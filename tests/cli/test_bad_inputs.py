@@ -359,6 +359,8 @@ def test_an_output_that_is_an_input(refused: Callable[..., str], finished: Path)
     for name in ("model.safetensors", "run.json"):
         refused(f"probe {finished} --json {finished / name}", "would overwrite what the command reads")
     refused(f"bench board {finished}/run.json --out {finished}/run.json", "would overwrite what the command reads")
+    (finished / "policy.py").touch()
+    refused(f"ablate {finished}/policy.py:act --data a --json {finished}/policy.py", "would overwrite what the command")
 
 
 def fill_disk(monkeypatch: pytest.MonkeyPatch, name: str) -> None:

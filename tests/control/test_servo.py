@@ -156,6 +156,8 @@ CHANGES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "other tasks": lambda value: value["rows"][0]["cells"].pop(),
     "this version reads 1": lambda value: value.update(format_version=2),
     "the name of a control": lambda value: value["encoder"].update(name="true pose"),
+    "has the unknown field 'film'": put("film", value=1),
+    "has the unknown field 'score'": put("rows", 0, "cells", 0, "score", value=1.0),
     "weights for seeds": lambda value: value["encoder"]["weights"].append("0"),
 }
 

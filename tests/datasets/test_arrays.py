@@ -168,6 +168,14 @@ def test_groups_inside_each_other(tmp_path: Path) -> None:
     assert [row["demo"] for row in table.rows] == ["/".join(["g"] * 3000)] * 4 and time.monotonic() - start < 10
 
 
+def test_columns_of_episodes_are_ours(tmp_path: Path) -> None:
+    """A dataset that is called demo must not split demonstrations over train and test."""
+    path = demos(tmp_path, **{"data/demo_1/demo": np.arange(5)})
+    table = read_arrays(path, [path], ("obs/camera",), ())
+    assert {row["demo"] for row in table.rows} == {f"data/demo_{k}" for k in range(4)}
+    assert table.notes == ("demo of demos.hdf5 is left out, this column is ours: rename it",)
+
+
 def test_what_a_demonstration_lacks(tmp_path: Path) -> None:
     path = demos(tmp_path, **{"data/demo_1/force": None, "data/demo_3/obs/gel": None})
     with pytest.raises(ValueError, match=r"row 13 \(data/demo_3/0\) has no obs/gel path: .*--data\.allow-missing"):
@@ -239,6 +247,9 @@ def test_a_replay_buffer_in_zarr(tmp_path: Path, kind: str) -> None:
         assert config.source().stamps() != before
         root["meta/episode_ends"][3] = 19
         with pytest.raises(ValueError, match=r"meta/episode_ends does not rise to 20"):
+            config.source()
+        (path / "data" / "gel" / "more").symlink_to(tmp_path)
+        with pytest.raises(ValueError, match=r"more is a link: copy what it shows into .*b\.zarr"):
             config.source()
 
 

@@ -133,6 +133,11 @@ def test_val_is_carved_from_train_by_group_if_there_is_none(tmp_path: Path, monk
     groups = pack.column("group")
     assert len(rows.val) and not set(groups[rows.val]) & set(groups[rows.train])
     assert not set(groups[rows.val]) & set(groups[rows.test])
+    monkeypatch.setattr(
+        Pack, "column", lambda *given: np.full(pack.num, "one") if given[1] == "group" else without_val(*given)
+    )
+    rows = split_rows(pack, pack.spec.tasks[0])
+    assert len(rows.val) and not set(rows.val) & set(rows.train), "rows of the one group"
 
 
 def test_every_score_has_its_controls(result: dict) -> None:

@@ -36,7 +36,7 @@ VOLATILE = ("digest", "about")  # fields that the digest leaves out
 KEY = ("source", "seed", "modality", "probe")
 COUNTS = ("n", "correct")  # sums per group of classes: rows, and those that are right
 ABOUT_ROWS = ("n", "value", "squared_value")  # sums that depend on the rows alone
-FIELDS = ("format", "format_version", "suite", "suite_digest", "encoder", "versions", "blocks", *VOLATILE)
+FIELDS = ("format", "format_version", "suite", "suite_digest", "encoder", "versions", *VOLATILE)
 ABOUT = ("python", "machine", "commit", "time", "seconds")
 ENCODER = ("external", "method", "features", "licence", "trained_on", "images_seen", "size", "parameters")
 ENCODER = ("name", "seeds", "weights", *ENCODER)
@@ -149,11 +149,7 @@ def problems(value: dict[str, Any]) -> list[str]:
     """What is missing in a result, or cannot be, in one line each: tasks, scores, controls, sums, data."""
     suite, encoder = suite_of(value), value["encoder"]
     found = list(problems_of(encoder, (*CONTROLS, GUESS)))
-    parts = [(value, FIELDS), (value.get("about", {}), ABOUT), (encoder, ENCODER)]
-    parts.append((encoder.get("external", {}), EXTERNAL))
-    parts += [(block, BLOCK) for block in value["blocks"]]
-    for fields, known in parts:
-        found += [f"has the unknown field {name!r}" for name in sorted(fields.keys() - {*known})]
+    found += unknown_fields(value, [(value, (*FIELDS, "blocks")), *((block, BLOCK) for block in value["blocks"])])
     asked = [(one, ask) for one in suite.sets for ask in one.tasks]
     if (want := [(s.name, t.name) for s, t in asked]) != (have := [(b["set"], b["task"]) for b in value["blocks"]]):
         return [*found, f"has the tasks {have}, the suite asks for {want}"]
@@ -171,6 +167,14 @@ def problems(value: dict[str, Any]) -> list[str]:
         if "not_run" not in block:
             found += [f"{one.name}, {ask.name}: {text}" for text in _of_block(block, suite, one, ask, encoder)]
     return found
+
+
+def unknown_fields(value: dict[str, Any], parts: Sequence[tuple[dict[str, Any], Sequence[str]]]) -> Iterator[str]:
+    """What nobody reads: fields of each of ``parts`` and of what all results have."""
+    encoder = value["encoder"]
+    shared = (value.get("about", {}), ABOUT), (encoder, ENCODER), (encoder.get("external", {}), EXTERNAL)
+    for fields, known in (*shared, *parts):
+        yield from (f"has the unknown field {name!r}" for name in sorted(fields.keys() - {*known}))
 
 
 def wrong_name(name: str, controls: Sequence[str]) -> str:
@@ -206,14 +210,17 @@ def _of_block(
         yield f"has {len(block['leaks'])} leak marks for {len(encoder['seeds'])} seeds"
     if "external" in encoder and {*block["leaks"]} != {declared_leak(encoder["trained_on"], one.names)}:
         yield f"its marks of leaks are not those of data trained on, {encoder['trained_on']}"
-    if not all(isinstance(text, str) for text in (*block["leaks"], block.get("group_by"), *block["groups"])):
-        yield "a leak mark, a group or what groups are is no text"
+    texts = *block["leaks"], *block["groups"], *block.get("notes", ()), block.get("group_by")
+    if not all(isinstance(text, str) for text in texts):
+        yield "a leak mark, a note, a group or what groups are is no text"
     if len({*block["groups"]}) < len(block["groups"]):
         yield "a group is there twice"
     if encoder["name"] in {record["source"] for record in records}:
         yield f"the encoder has the name of a control, {encoder['name']!r}: give --name"
     have = Counter((r["source"], r["modality"], r["probe"], r["seed"]) for r in records)
     want = _expected(suite, ask, block, encoder["seeds"], "targets" in records[0] if records else False)
+    asked = [text for form in one.forms if form.name == block["form"] for text in form.data.get("controls", ())]
+    want |= {((text.rpartition("=")[0] or text).strip(), "none", "linear", None) for text in asked}
     own = {key for key in have if key[1:] == ("none", "linear", None) and key[0] not in CONTROLS}  # columns of the data
     for what, keys in (("lacks", want - have.keys()), ("has too much of", have.keys() - want - own)):
         for source, *key in sorted(keys, key=str):
@@ -286,4 +293,6 @@ def _impossible(record: dict[str, Any], num_groups: int) -> str:
         return "its squared errors are smaller or larger than its errors allow"
     square, of = sums["squared_value"] * n, sums["value"] ** 2
     wrong = (square < least * of).any() or (least * square > of)[n == 1].any()
+    if record["source"] == "mean" and (n * squared < square - of - 1e-6 * square).any():  # one answer per group
+        return "its errors are smaller than those of any one answer"
     return "its squares are not those of its values" if wrong else ""

@@ -26,7 +26,7 @@ class _Options:
     models: Positional[tuple[str, ...]]
     """The encoder: the folder of a run or an artifact, or an id on the Hub; several are seeds of one encoder."""
     suite: str
-    """Name of a suite, or a TOML file of the same form."""
+    """Name of a suite, or a TOML file of a suite of tasks."""
     out: Path = Path("results")
     """Folder of results. An interrupted bench continues from <out>/parts."""
     data_root: Path | None = None

@@ -125,10 +125,12 @@ def _check_choices(rest: Sequence[str], text: Path) -> None:
 
 def _check_outputs(words: Sequence[str]) -> None:
     """ValueError for an output that is an input, or one of the files ``OWN`` of a run, pack or export that is one."""
-    places = [re.sub(r"#.*|@[\d.]+$", "", part) for word in words for part in word.split("=")]
+    places = [part for word in words for part in word.split("=")]
     for at, (option, out) in enumerate(itertools.pairwise(places)):
         if option in ("--out", "--json", "--sheet") and os.path.isfile(out):
-            inputs = [place for place in (*places[: at + 1], *places[at + 2 :]) if os.path.exists(place)]
+            others = (*places[: at + 1], *places[at + 2 :])
+            parts = [part for each in others for part in (re.sub(r"#.*|@[\d.]+$", "", each), *re.split("[,:]", each))]
+            inputs = [place for place in parts if os.path.exists(place)]
             own = [os.path.join(place, os.path.basename(out)) for place in inputs if out.endswith(OWN)]
             if any(os.path.exists(place) and os.path.samefile(out, place) for place in (*inputs, *own)):
                 raise ValueError(f"{option} {out} would overwrite what the command reads: choose another file")

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mvitac.bench.encoder import About, measure
-from mvitac.bench.result import problems_of, read_signed
+from mvitac.bench.result import FIELDS, problems_of, read_signed, unknown_fields
 from mvitac.bench.score import kept_part
 from mvitac.control.ablate import suite_episodes
 from mvitac.control.insert import Insert
@@ -99,6 +99,9 @@ def _problems(value: dict[str, Any], suite: Suite) -> Iterator[str]:
     have = [(row["source"], row["seed"]) for row in value["rows"]]
     if have not in ([*want, *rest], [*want, ("imagenet", None), *rest]):
         yield f"has the rows {have}, the suite asks for {want + rest}"
+    parts = [(value, (*FIELDS, "data", "rows")), *((row, ("source", "seed", "cells")) for row in value["rows"])]
+    cells = [cell for row in value["rows"] for cell in row["cells"]]
+    yield from unknown_fields(value, [*parts, *((cell, ("task", "condition", "n", *suite.sums)) for cell in cells)])
     yield from problems_of(value["encoder"], ["imagenet", *(source for source, _ in (*want, *rest))])
     for row in value["rows"]:
         who = row["source"] or "the encoder"

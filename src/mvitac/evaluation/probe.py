@@ -55,8 +55,8 @@ class ProbeSplit:
 def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
     """Labelled (or measured) rows of ``task`` by split that have an image of ``modality`` ("both": both, "none": any).
 
-    Without a validation split, a fifth of the training groups is set aside for it. ValueError if no labelled row is left in
-    train or in test, or a target has no different values there.
+    Without a validation split, a fifth of the training groups (or rows) is set aside for it. ValueError if no labelled
+    row is left in train or in test, or a target has no different values there.
     """
     having = names_in(modality, pack)
     known = pack.answered(task)
@@ -69,13 +69,14 @@ def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
     if isinstance(task, ValueTask):
         _check_measured(pack.values(task), task, {"train": np.concatenate([train, val]), "test": test})
     if not len(val):
-        groups = pack.column("group")[train].astype(str)
-        names = np.random.default_rng(0).permutation(np.unique(groups))
-        held = np.isin(groups, names[: max(1, len(names) // 5)])
-        one_class = isinstance(task, Task) and len(set(pack.labels(task.name)[train[~held]])) == 1
-        if held.all() or one_class:  # a single group: no rows can be held out
-            return ProbeSplit(train, train, test)
-        train, val = train[~held], train[held]
+        # Rows where too few groups, or one class, would be left: to fit and to choose on the same rows is worse.
+        for units in (pack.column("group")[train].astype(str), np.arange(len(train))):
+            names = np.random.default_rng(0).permutation(np.unique(units))
+            held = np.isin(units, names[: max(1, len(names) // 5)])
+            one_class = isinstance(task, Task) and len(set(pack.labels(task.name)[train[~held]])) == 1
+            if not held.all() and not one_class:
+                return ProbeSplit(train[~held], train[held], test)
+        val = train
     return ProbeSplit(train, val, test)
 
 

@@ -33,6 +33,7 @@ MAX_TEXT = 200
 """Characters of the longest attribute that is a column. robomimic keeps whole simulator files in attributes."""
 MAGIC = (b"\xff\xd8", b"\x89P")  # first bytes of a JPEG and of a PNG
 Refs = dict[str, list[ImageRef | None]]
+OWN = ("id", "demo", "frame")  # columns that episodes give
 LeftOut = dict[str, str]  # name of what is no column -> why
 
 
@@ -41,7 +42,7 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
 
     ``images`` are the names of image datasets, by default ``USUAL``; ``vectors`` those of datasets [N, K] that become
     columns of lists. Columns demo (the group's path, after the file's name where that is needed), frame (from 0) and id
-    are added if the file has none.
+    are added; what the file calls so is left out.
     """
     rows: list[dict[str, str]] = []
     found: Refs = {}
@@ -49,6 +50,8 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
     notes: dict[str, None] = {}
     seen = ""
     for file in files:
+        for link in filter(Path.is_symlink, file.rglob("*")):
+            raise ValueError(f"{link} is a link: copy what it shows into {file}")
         with open_arrays(file) as opened:
             everything = _datasets(opened)
             for name in _demonstrations(file, everything, images):
@@ -58,13 +61,17 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
                 num = len(next(iter(refs.values())))
                 cells = _constants(opened, name, vectors)
                 cells |= _columns(demo, datasets, num, refs, vectors, left_out)
+                taken = {*OWN} & {*cells}
+                notes |= {
+                    f"{column} of {file.name} is left out, this column is ours: rename it": None for column in taken
+                }
                 notes |= dict.fromkeys(_unwritten(file, {n: d for n, d in datasets.items() if n in {**refs, **cells}}))
                 episodes = _episodes(demo, everything.get("meta/episode_ends"), num)
                 for column in {**found, **refs}:
                     found.setdefault(column, [None] * len(rows)).extend(refs.get(column, [None] * num))
                 for i, (episode, frame) in enumerate(episodes):
-                    own = {"id": f"{episode}/{frame}", "demo": episode, "frame": str(frame)}
-                    rows.append(own | {column: texts[i % len(texts)] for column, texts in cells.items()})
+                    own = dict(zip(OWN, (f"{episode}/{frame}", episode, str(frame)), strict=True))
+                    rows.append({column: texts[i % len(texts)] for column, texts in cells.items()} | own)
             seen = _seen(everything)
     if missing := [name for name in images if name not in found]:
         raise _no_images(path, missing, seen)
@@ -133,8 +140,8 @@ def _episodes(demo: str, ends: Any, num: int) -> list[tuple[str, int]]:
     if ends is None:
         return [(demo, i) for i in range(num)]
     whole = ends.ndim == 1 and 0 < ends.size <= num
-    starts = np.r_[0, np.asarray(ends[...], np.int64)] if whole else np.zeros(1)
-    if starts[-1] != num or (np.diff(starts) <= 0).any():
+    starts = np.r_[0, np.asarray(ends[...])] if whole else np.zeros(1)
+    if starts[-1] != num or (np.diff(starts) <= 0).any() or (starts % 1).any():
         raise ValueError(f"{demo}: meta/episode_ends does not rise to {num}, the number of images")
     number = np.searchsorted(starts[1:], np.arange(num), side="right")
     starts = starts[number]
