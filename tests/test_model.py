@@ -45,8 +45,7 @@ def test_embed_equals_the_probes_features(model: Model, pack: Pack) -> None:
     rows = np.array([3, 50, 119])
     for modality in ("vision", "touch"):
         expected = pack_features(model, pack, modality, rows)
-        found = model.embed(**{modality: pack.images[modality][rows]})[modality]
-        assert torch.equal(found, expected)
+        assert torch.equal(model.embed(**{modality: pack.images[modality][rows]})[modality], expected)
 
 
 def test_whole_images_are_seen_at_their_own_size(model: Model, pack: Pack) -> None:
@@ -54,8 +53,7 @@ def test_whole_images_are_seen_at_their_own_size(model: Model, pack: Pack) -> No
     method, run = model.run.method.build(pack.spec, model.run.encoder), replace(model.run, augment=crops)
     smaller = Model(method, run, pack.spec, 32)
     images = torch.from_numpy(pack.images["touch"][[0, 1, 2, 3]]).permute(0, 3, 1, 2)
-    expected = smaller.encoders["touch"](plain_view(images, 24)).detach()
-    assert torch.equal(smaller.features("touch", images), expected)
+    assert torch.equal(smaller.features("touch", images), smaller.encoders["touch"](plain_view(images, 24)).detach())
     as_trained = smaller.encoders["touch"](plain_view(images, 16)).detach()  # heads keep to the side they learned from
     assert torch.equal(smaller.features("touch", images, for_heads=True), as_trained)
     assert torch.equal(smaller.embed(touch=pack.images["touch"][[0]])["touch"], smaller.features("touch", images[:1]))
@@ -107,8 +105,7 @@ def test_floats_are_taken_as_levels_or_refused(artifact: Path, pack: Pack) -> No
     torch.testing.assert_close(model.features("touch", scaled), expected, **close)
     torch.testing.assert_close(model(touch=scaled)["touch"].detach(), expected, **close)
     torch.testing.assert_close(model.embed(touch=scaled)["touch"], expected, **close)
-    classes = model.predict(touch=images)
-    torch.testing.assert_close(model.predict(touch=scaled), classes, **close)
+    torch.testing.assert_close(model.predict(touch=scaled), model.predict(touch=images), **close)
     calls = (
         lambda x: model.features("touch", x),
         lambda x: model(touch=x),
@@ -131,8 +128,7 @@ def test_forward_gives_the_features_of_embed_with_gradients(model: Model, pack: 
         assert list(found) == ["vision", "touch"]
         for modality, features in found.items():
             assert features.requires_grad and torch.equal(features, expected[modality])
-    generator = torch.Generator().manual_seed(0)
-    large = torch.randint(0, 256, (2, 3, 50, 80), dtype=torch.uint8, generator=generator)
+    large = torch.randint(0, 256, (2, 3, 50, 80), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     twice = copy.deepcopy(model)
     twice.run = replace(model.run, augment=replace(model.run.augment, size=20))
     expected = twice.embed(touch=large)["touch"]  # other sizes are resized like raw images: to 32, then to 20
@@ -157,8 +153,7 @@ class Touches(torch.utils.data.Dataset):  # at module level, so that a worker th
 def test_transform_prepares_images_in_a_data_loader(model: Model) -> None:
     images = np.random.default_rng(1).integers(0, 256, (5, 40, 60, 3), dtype=np.uint8)
     expected = model.embed(touch=images)["touch"]
-    loader = DataLoader(Touches(images, model.transform("touch")), batch_size=5, num_workers=1)
-    (loaded,) = loader
+    (loaded,) = DataLoader(Touches(images, model.transform("touch")), batch_size=5, num_workers=1)
     assert loaded.shape == (5, 3, 32, 32) and loaded.dtype == torch.uint8
     assert torch.equal(model(touch=loaded)["touch"], expected)
     normalised = pickle.loads(pickle.dumps(model.transform("touch", normalize=True)))
@@ -216,8 +211,7 @@ def test_embed_resizes_as_the_pack_does(model: Model) -> None:
 
 
 def test_background_is_subtracted_at_the_stored_size_as_in_packs(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(3)
-    large = rng.integers(0, 255, (2, 2, 80, 100, 3), dtype=np.uint8)
+    large = np.random.default_rng(3).integers(0, 255, (2, 2, 80, 100, 3), dtype=np.uint8)
     free, press = (np.stack([fit(image, 32) for image in images]) for images in large)
     with pytest.raises(ValueError, match="background cannot be used"):
         model.embed(touch=press, background=free)

@@ -117,8 +117,7 @@ def test_grasps_have_the_recipe_of_the_simulator_however_they_are_read(
         words += ["--data.test-share", "0", "--data.val-share", "0", "--data.touch-group", "touch_group"]
     assert main(["pretrain", *words, "--out", str(tmp_path / "run")]) == 0
     run, _ = load_run(tmp_path / "run")
-    assert run.positives == "same-image"
-    assert (run.augment.vision.grayscale, run.augment.touch.grayscale) == (0, 0.1)
+    assert run.positives == "same-image" and (run.augment.vision.grayscale, run.augment.touch.grayscale) == (0, 0.1)
 
 
 def test_rows_with_other_phases_are_no_grasps(pack: Pack) -> None:

@@ -49,8 +49,7 @@ def test_train_is_of_the_one_and_test_of_the_other(pack: Pack, negative: Pack) -
     np.testing.assert_array_equal(both.labels("pattern"), np.tile(pack.labels("pattern"), 2), "classes go by name")
     assert both.has("touch").all() and not both.spec.controls
     assert both.spec.name == f"{negative.path.name}, probes learned on {pack.path.name}"
-    assert both.digest not in (pack.digest, negative.digest)
-    assert JoinedPack(negative, pack).digest != both.digest
+    assert both.digest not in (pack.digest, negative.digest) and JoinedPack(negative, pack).digest != both.digest
 
 
 @pytest.mark.parametrize("column", ["sensor", "lamp", "phase"])
@@ -124,7 +123,6 @@ def test_probe_learns_on_one_pack_and_meets_another(
     assert result["pack"] == JoinedPack(pack, negative).digest
     assert {r["num_test"] for r in result["records"]} == {len(negative.rows("test"))}
     sources = {"mvitac", "imagenet", "majority", "untrained", "pixels", "border"}
-    assert {r["source"] for r in result["records"]} == sources
-    assert "probes learned on" in capsys.readouterr().out
+    assert {r["source"] for r in result["records"]} == sources and "probes learned on" in capsys.readouterr().out
     assert main(["probe", str(tmp_path / "run"), "--learn-on", str(pack.path)]) == 2
     assert "name the pack on which they are scored, --on PACK" in " ".join(capsys.readouterr().err.split())

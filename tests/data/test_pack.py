@@ -148,8 +148,7 @@ def test_packs_where_files_cannot_be_locked(pack: Pack, tmp_path: Path, monkeypa
         raise OSError(errno.ENOSYS, "Function not implemented")
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    assert toy_pack(tmp_path / "p").digest == pack.digest
-    assert [path.name for path in tmp_path.iterdir()] == ["p"]
+    assert toy_pack(tmp_path / "p").digest == pack.digest and [path.name for path in tmp_path.iterdir()] == ["p"]
 
 
 def killed(*_: object) -> None:
@@ -212,8 +211,7 @@ def test_killed_while_it_is_finished(pack: Pack, tmp_path: Path, monkeypatch: py
     again = Stamped(damaged=(3, 40))
     build(again, tmp_path / "p", **options)
     assert not again.seen
-    straight = build(Toy(damaged=(3, 40)), tmp_path / "straight", **options)
-    assert contents(tmp_path / "p") == contents(straight.path)
+    assert contents(tmp_path / "p") == contents(build(Toy(damaged=(3, 40)), tmp_path / "straight", **options).path)
     build(Stamped(changed=(3, 40)), tmp_path / "q", **options)  # repaired
     assert contents(tmp_path / "q") == contents(pack.path)
 
@@ -327,8 +325,7 @@ def test_scoring_on_val_hides_test(pack: Pack) -> None:
     np.testing.assert_array_equal(choosing.rows("train", "unlabelled"), whole.rows("train", "unlabelled"))
     assert not len(choosing.rows("val")) and choosing.spec.notes == (*whole.spec.notes, ON_VAL)
     task = whole.spec.tasks[0].name
-    unseen = whole.rows("test")
-    assert (choosing.labels(task, "train", "val", "test")[unseen] == -1).all()
+    assert (choosing.labels(task, "train", "val", "test")[whole.rows("test")] == -1).all()
 
 
 def test_rows_of_one_task_alone_are_hidden_from_all_else(pack: Pack) -> None:

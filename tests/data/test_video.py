@@ -111,8 +111,7 @@ def test_shrinking_is_that_of_pillow(made: dict[str, Path]) -> None:
     path = write_video(made["mpeg4"].with_name("noise.mp4"), 1, lambda _: small.repeat(10, 0).repeat(10, 1))
     (_, whole), (_, shrunk) = *frames(path, [0]), *frames(path, [0], 50)
     expected = np.asarray(Image.fromarray(whole).resize((50, 50), Image.Resampling.BILINEAR)).astype(int)
-    difference = np.abs(shrunk - expected)
-    assert difference.mean() < 2
+    assert np.abs(shrunk - expected).mean() < 2
     nearest = np.asarray(Image.fromarray(whole).resize((50, 50), Image.Resampling.NEAREST)).astype(int)
     assert np.abs(shrunk - nearest).mean() > 5  # dropping pixels would show
 
@@ -188,8 +187,7 @@ def test_a_lost_chunk_shifts_no_number(made: dict[str, Path], tmp_path: Path) ->
 
 def test_a_file_cut_off_behind_its_table_gives_what_it_holds(tmp_path: Path) -> None:
     path = write_video(tmp_path / "v.mp4", NUM, lambda i: numbered(i, "touch"), flags={"movflags": "faststart"})
-    at = packets_of(path)[80][0]
-    (tmp_path / "cut.mp4").write_bytes(path.read_bytes()[:at])
+    (tmp_path / "cut.mp4").write_bytes(path.read_bytes()[: packets_of(path)[80][0]])
     lost: dict[int, str] = {}
     found = dict(frames(tmp_path / "cut.mp4", range(70, 90), lost=lost))
     assert {*range(70, 80)} == {*found} and {*range(80, 90)} == {*lost}
@@ -203,8 +201,7 @@ def test_frames_that_are_not_there(made: dict[str, Path]) -> None:
     with pytest.raises(ValueError, match="frame -1 is wanted: frames are counted from 0"):
         list(frames(made["mpeg4"], [-1]))
     lost: dict[int, str] = {}
-    assert [i for i, _ in frames(made["mpeg4"], [149, 150, 900], lost=lost)] == [149]
-    assert sorted(lost) == [150, 900]
+    assert [i for i, _ in frames(made["mpeg4"], [149, 150, 900], lost=lost)] == [149] and sorted(lost) == [150, 900]
 
 
 def test_files_that_are_no_videos(made: dict[str, Path], tmp_path: Path) -> None:

@@ -67,8 +67,7 @@ def shown(pack: Pack, touch: int, frame: int, modality: str = "touch") -> list[i
 
 def test_a_window_shows_this_frame_and_earlier_ones_of_the_same_touch(presses: Pack) -> None:
     pack = windowed(presses, Window(frames=3))
-    assert shown(pack, 2, 5) == [5, 4, 3]
-    assert shown(pack, 2, 1) == [1, 0, 0]  # the first repeats
+    assert shown(pack, 2, 5) == [5, 4, 3] and shown(pack, 2, 1) == [1, 0, 0]  # the first repeats
     assert shown(pack, 1, 5) == [5, 4, 2]  # frame 3 is missing: the one before it
     assert shown(pack, 2, 5, "vision") == [5]
     assert shown(windowed(presses, Window(frames=3, stride=2)), 4, 5) == [5, 3, 1]
@@ -79,14 +78,12 @@ def test_a_window_shows_this_frame_and_earlier_ones_of_the_same_touch(presses: P
 def test_frames_are_found_by_their_place_not_by_their_row(presses: Pack) -> None:
     rows = np.random.default_rng(0).permutation(presses.num)
     pack = windowed(presses, Window(frames=2))
-    alone = [pack.images["touch"][int(row)] for row in rows]
-    assert np.array_equal(pack.images["touch"][rows], alone)
+    assert np.array_equal(pack.images["touch"][rows], [pack.images["touch"][int(row)] for row in rows])
 
 
 def test_rows_at_the_start_can_be_left_out(presses: Pack) -> None:
     pack = windowed(presses, Window(frames=3, short="leave-out"))
-    kept = pack.rows("train", "val", "test")
-    assert sorted(set(pack.column("frame")[kept].tolist())) == [2, 3, 4, 5]
+    assert sorted(set(pack.column("frame")[pack.rows("train", "val", "test")].tolist())) == [2, 3, 4, 5]
     assert len(windowed(presses, Window(frames=3)).rows("train", "val", "test")) == presses.num
 
 
@@ -94,8 +91,7 @@ def test_the_first_frame_of_the_touch_can_be_subtracted(presses: Pack) -> None:
     pack = windowed(presses, Window(frames=2, minus_first=True))
     for row in range(presses.num):
         frame = int(pack.column("frame")[row])
-        image = pack.images["touch"][row]
-        assert (image[..., :3] == 128 + frame).all()
+        assert (pack.images["touch"][row][..., :3] == 128 + frame).all()
 
 
 def test_other_windows_are_other_data_and_single_frames_are_the_pack_itself(presses: Pack) -> None:
@@ -153,8 +149,7 @@ def test_positives_can_be_near_in_time(presses: Pack, tmp_path: Path) -> None:
     found = draw_positives(presses, rows, torch.Generator().manual_seed(0), within=2)
     away = (presses.column("frame")[found] - presses.column("frame")[rows]).astype(int)
     assert np.array_equal(presses.touch_groups[found], presses.touch_groups[rows])
-    first = presses.column("frame")[rows] == 0
-    assert set(away[first].tolist()) == {1, 2} and set(away.tolist()) == {-2, -1, 1, 2}
+    assert set(away[presses.column("frame")[rows] == 0].tolist()) == {1, 2} and set(away.tolist()) == {-2, -1, 1, 2}
     assert (np.abs(draw_positives(presses, rows, torch.Generator().manual_seed(0)) - rows) > 0).all()
     alone = draw_positives(presses, rows, torch.Generator().manual_seed(0), within=0.5)
     assert np.array_equal(alone, rows)  # no frame is as near

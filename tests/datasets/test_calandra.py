@@ -184,8 +184,7 @@ def test_the_authors_split(forty_four: Path) -> None:
     assert {name for name, split in splits.items() if split == "test"} == set(AUTHORS_TEST)
     assert {name for name, split in splits.items() if split in ("train", "val")} == set(AUTHORS_TRAIN)
     assert sum(split == "val" for split in splits.values()) == round(0.15 * 32)
-    without_val = splits_of(CalandraConfig(path=forty_four, val_share=0.0))
-    assert Counter(without_val.values()) == {"train": 32, "test": 8}
+    assert Counter(splits_of(CalandraConfig(path=forty_four, val_share=0.0)).values()) == {"train": 32, "test": 8}
 
 
 def test_the_owners_split(forty_four: Path) -> None:
@@ -218,15 +217,13 @@ def leaking(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def leaking_pack(leaking: Path, out: Path, **options: Any) -> Pack:
-    config = CalandraConfig(path=leaking, size=32, **options)
-    return build(config.source(), out, size=32, quiet=True)
+    return build(CalandraConfig(path=leaking, size=32, **options).source(), out, size=32, quiet=True)
 
 
 def test_after_has_no_label(leaking: Path, tmp_path: Path) -> None:
     pack = leaking_pack(leaking, tmp_path / "p")
     assert [task.name for task in pack.spec.tasks] == ["success"]
-    labelled = pack.column("label_success") >= 0
-    assert set(pack.column("phase")[labelled]) == {"during"}
+    assert set(pack.column("phase")[pack.column("label_success") >= 0]) == {"during"}
     rows = split_rows(pack, pack.spec.tasks[0])
     for part in (rows.train, rows.val, rows.test):
         assert len(part) and set(pack.column("phase")[part]) == {"during"}

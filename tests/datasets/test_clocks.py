@@ -29,8 +29,7 @@ START = 1_700_000_000.0
 
 
 def packed(path: Path, out: Path, **options: Any) -> Pack:
-    config = FolderConfig(path=path, size=16, **options)
-    return build(config.source(), out, size=16, quiet=True)
+    return build(FolderConfig(path=path, size=16, **options).source(), out, size=16, quiet=True)
 
 
 def write_csv(file: Path, **columns: Any) -> Path:
@@ -77,8 +76,7 @@ def test_nothing_is_extrapolated_and_what_is_left_out_is_counted(tmp_path: Path)
     (root / "0/force.csv").write_text("\n".join(lines[:40] + lines[60:]))  # no measurement from .893 to 1.093 s
     pack = packed(root, tmp_path / "p", **LOG)
     time, own = pack.column("time").astype(float), pack.column("recording")
-    assert time.min() >= 0.503 and time.max() <= 1.493
-    assert not ((time > 0.893) & (time < 1.093) & (own == "0")).any()
+    assert time.min() >= 0.503 and time.max() <= 1.493 and not ((time > 0.893) & (time < 1.093) & (own == "0")).any()
     assert ((time > 0.893) & (time < 1.093) & (own == "1")).sum() == 5
     (note,) = pack.spec.notes
     said = rf"force\.csv joined by stamp, its largest gap is 0\.21 s; {150 - pack.num} of 150 rows are not .*"
@@ -235,8 +233,7 @@ def test_stamps_are_seconds_whatever_their_unit(monkeypatch: pytest.MonkeyPatch)
     assert np.isnan(seconds(["", "1"], "")[0]) and seconds(["1.5"], "")[0] == 1.5
     monkeypatch.setenv("TZ", "America/New_York")  # a date without an offset is the same on every computer
     time.tzset()
-    dates = ["2023-11-14T22:13:20.25", "2023-11-14T17:13:23.5-05:00"]
-    assert np.allclose(seconds(dates, ""), times)
+    assert np.allclose(seconds(["2023-11-14T22:13:20.25", "2023-11-14T17:13:23.5-05:00"], ""), times)
     monkeypatch.undo()
     time.tzset()
 

@@ -257,8 +257,7 @@ def test_lerobot_reads_values_and_elements_of_vectors(tmp_path: Path) -> None:
     plain = LeRobotConfig(path=root, size=16).source()
     config = LeRobotConfig(path=root, size=16, values=("pose=observation.state[0]:mm,timestamp:s",))
     pack = packed(config, tmp_path / "pack")
-    units = {t.name: t.unit for t in pack.spec.values[0].targets}
-    assert units == {"observation.state[0]": "mm", "timestamp": "s"}
+    assert {t.name: t.unit for t in pack.spec.values[0].targets} == {"observation.state[0]": "mm", "timestamp": "s"}
     at = np.array([e * 100 + i for e, length in enumerate(LENGTHS) for i in range(length)])
     assert (pack.column("episode").astype(int) * 100 + pack.column("frame").astype(int) == at).all()
     values, _ = measured(pack)

@@ -117,8 +117,7 @@ def test_csv_parquet_and_jsonl_give_one_pack(tmp_path: Path) -> None:
 
 
 def test_two_workers_give_the_pack_of_one(tmp_path: Path, rows: Table, monkeypatch: pytest.MonkeyPatch) -> None:
-    many = [row for row in rows for _ in range(6)]
-    options = config(write(many, tmp_path / "manifest.csv"))
+    options = config(write([row for row in rows for _ in range(6)], tmp_path / "manifest.csv"))
     one = packed(options, tmp_path / "one")
     sent: list[Rows] = []
     monkeypatch.setattr(Rows, "__getstate__", lambda self: sent.append(self) or self.__dict__, raising=False)
@@ -206,8 +205,7 @@ def test_two_ways_to_type_a_name_are_one(tmp_path: Path, rows: Table) -> None:
         if row["material"]:
             clean["material"], row["material"] = names[row["material"]][0], names[row["material"]][i % 3]
             clean["material"] = clean["material"].replace("  ", " ")
-    typed = config(write(rows, tmp_path / "typed.csv"), only=("object!=tasse   002",))
-    pack = packed(typed, tmp_path / "typed")
+    pack = packed(config(write(rows, tmp_path / "typed.csv"), only=("object!=tasse   002",)), tmp_path / "typed")
     other = packed(config(write(same, tmp_path / "same.csv"), only=("object!=tasse 002",)), tmp_path / "same")
     assert pack.spec.tasks[0].classes == ("Nan", "caf\u00e9 au lait") == other.spec.tasks[0].classes
     assert set(pack.column("group")) == {f"tasse {i:03d}" for i in (0, 1, 3, 4, 5, 6, 7)}

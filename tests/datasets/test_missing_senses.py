@@ -65,8 +65,7 @@ def test_training_sees_whole_pairs_only(holes: Pack, tmp_path: Path, monkeypatch
     whole = holes.has("vision") & holes.has("touch")
     assert whole[seen].all() and set(seen) <= set(holes.rows("train", "unlabelled"))
 
-    found = draw_positives(holes, np.array(seen), torch.Generator().manual_seed(0))
-    assert whole[found].all()
+    assert whole[draw_positives(holes, np.array(seen), torch.Generator().manual_seed(0))].all()
 
 
 def test_probes_see_only_what_is_there(holes: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,8 +58,7 @@ def make_slip_gsmini(root: Path) -> None:
             if slips:
                 (folder / "slip.txt").touch()
             if k < 5:
-                other = "bag_of_peanuts" if k == 3 else name
-                copy = root / "docs/base_data" / side / other / f"exp_num_{n}"
+                copy = root / "docs/base_data" / side / ("bag_of_peanuts" if k == 3 else name) / f"exp_num_{n}"
                 shutil.copytree(folder, copy)
                 if k == 2 and slips:
                     (copy / "slip.txt").unlink()
@@ -139,8 +138,7 @@ def test_the_contract(packs: dict[str, Pack], clones: Path, name: str) -> None:
     groups = {split: set(pack.column("group")[pack.rows(split)]) for split in ("train", "val", "test")}
     assert groups["train"] and groups["test"] and not groups["test"] & (groups["train"] | groups["val"])
     for task in pack.spec.tasks:
-        labels = pack.column(f"label_{task.name}")
-        assert all((labels[pack.rows(split)] >= 0).any() for split in ("train", "test"))
+        assert all((pack.column(f"label_{task.name}")[pack.rows(split)] >= 0).any() for split in ("train", "test"))
     _, kind = SETS[name]
     config = kind(path=clones / name, size=16)  # type: ignore[call-arg]
     assert config.source().fingerprint() == kind(path=clones / name, size=16).source().fingerprint()  # type: ignore[call-arg]
@@ -158,8 +156,7 @@ def test_every_group_is_tested_once() -> None:
     groups = [f"g{i % 17}" for i in range(100)]
     strata = [f"s{i % 17 % 3}" for i in range(100)]
     columns = folds(groups, strata, 4)
-    tested = np.array([[side == "test" for side in column] for column in columns.values()])
-    assert (tested.sum(0) == 1).all()
+    assert (np.array([[side == "test" for side in column] for column in columns.values()]).sum(0) == 1).all()
     for column in columns.values():
         assert len({*zip(groups, column, strict=True)}) == 17
         for stratum in set(strata):
@@ -218,8 +215,7 @@ def test_slip_gsmini_counts_copies_once(packs: dict[str, Pack]) -> None:
         conflict = k == 2 and (k + n) % 3 == 0
         assert pack.column("label_slip")[i] == (-1 if conflict else int((k + n) % 3 == 0))
         assert pack.column("label_conflict")[i] == str(int(conflict))
-        assert pack.column("author_split")[i] == ("train" if k < 6 else "val")
-        assert pack.column("n_frames")[i] == 30 + n
+        assert pack.column("author_split")[i] == ("train" if k < 6 else "val") and pack.column("n_frames")[i] == 30 + n
     assert (pack.column("label_conflict") == "1").sum() == 12
 
 

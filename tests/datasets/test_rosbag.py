@@ -56,8 +56,7 @@ def test_topics_are_joined_by_the_time_in_their_headers(tmp_path: Path, plugin: 
     for number in range(3):
         write_bag(tmp_path / f"bags/grasp.{number}", plugin, number)
     options: dict[str, Any] = {"touch": (GEL,), "vision": FRONT, "values": (f"{WRENCH}.wrench.force.z:N",), "size": 16}
-    config = RosbagConfig(path=tmp_path / "bags", every=1, tolerance=0.045, **options)
-    pack = packed(config, tmp_path / "pack")
+    pack = packed(RosbagConfig(path=tmp_path / "bags", every=1, tolerance=0.045, **options), tmp_path / "pack")
     time, which = pack.column("time").astype(float) - START, pack.column("recording")
     assert set(which) == {"grasp.0", "grasp.1", "grasp.2"} and pack.spec.group_by == "recording"
     assert np.allclose(pack.values(pack.spec.values[0])[:, 0], 3 * time, atol=1e-5)

@@ -39,8 +39,7 @@ def table(file: Path, rows: Table) -> Path:
 
 
 def packed(path: Path, out: Path, *, workers: int = 1, **options: Any) -> Pack:
-    config = FolderConfig(path=path, size=16, **options)
-    return build(config.source(), out, size=16, workers=workers, quiet=True)
+    return build(FolderConfig(path=path, size=16, **options).source(), out, size=16, workers=workers, quiet=True)
 
 
 @pytest.fixture(scope="module")

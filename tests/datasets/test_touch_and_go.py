@@ -187,8 +187,7 @@ def test_by_recording_gives_every_side_its_share_of_every_category() -> None:
 def test_stratify_reaches_the_best_where_it_can_be_counted(seed: int) -> None:
     kinds = np.repeat(np.array([[10, 0, 0], [0, 20, 0], [5, 5, 0]]), 8, axis=0)  # 8 alike groups of each of 3 kinds
     side = stratify(kinds, (0.5, 0.25, 0.25), seed)
-    dealt = np.stack([np.bincount(side[8 * k : 8 * k + 8], minlength=3) for k in range(3)])
-    assert dealt.tolist() == [[4, 2, 2]] * 3
+    assert np.stack([np.bincount(side[8 * k : 8 * k + 8], minlength=3) for k in range(3)]).tolist() == [[4, 2, 2]] * 3
 
 
 def check_pairs(pack: Pack) -> None:
@@ -216,13 +215,11 @@ def test_jpegs_and_videos_give_the_same_pairs(official: Pack, tmp_path: Path) ->
 def test_three_tasks_share_the_rows(official: Pack) -> None:
     category, soft, rough = (official.column(f"label_{task}") for task in ("category", "soft", "rough"))
     assert [task.classes for task in official.spec.tasks[1:]] == [("hard", "soft"), ("smooth", "rough")]
-    assert official.spec.tasks[0].classes == CLASSES and len(CLASSES) == 20
-    assert ((category < 0) == (soft < 0)).all()
+    assert official.spec.tasks[0].classes == CLASSES and len(CLASSES) == 20 and ((category < 0) == (soft < 0)).all()
     assert (soft[category >= 0] == np.isin(category[category >= 0], SOFT)).all()
     last = official.column("group") == NAMES[7]
     assert (category[last] == -1).all() and (rough[last] >= 0).all()
-    frame = official.column("frame")
-    assert (rough[rough >= 0] == (frame[rough >= 0] < 100)).all()
+    assert (rough[rough >= 0] == (official.column("frame")[rough >= 0] < 100)).all()
 
 
 def test_the_official_split_is_the_lists(official: Pack) -> None:
@@ -253,8 +250,7 @@ def test_val_is_carved_from_train_by_recording(tree: Path, tmp_path: Path) -> No
 
 def test_by_recording_shares_no_recording(tree: Path, tmp_path: Path) -> None:
     pack = packed(tree, tmp_path / "pack", modalities="touch")
-    group = pack.column("group")
-    sides = [set(group[pack.rows(name)]) for name in ("train", "val", "test")]
+    sides = [set(pack.column("group")[pack.rows(name)]) for name in ("train", "val", "test")]
     assert all(sides) and sum(map(len, sides)) == len(set().union(*sides)) == 8
     assert not pack.spec.notes and pack.spec.name == "touch-and-go (by-recording)"
     assert {task.split for task in pack.spec.tasks} == {"split"}

@@ -49,8 +49,7 @@ def test_equal_rows_come_in_row_order_and_missing_ones_last() -> None:
     bank = np.repeat(np.eye(3, dtype=np.float32), 2, axis=0)
     bank[3] = np.nan
     rows, cosines = nearest(bank, np.eye(3, dtype=np.float32)[[2, 1]], 9)  # no more than there are
-    assert rows.tolist() == [[4, 5, 0, 1, 2, 3], [2, 0, 1, 4, 5, 3]]
-    assert cosines[0].tolist() == [1, 1, 0, 0, 0, -np.inf]
+    assert rows.tolist() == [[4, 5, 0, 1, 2, 3], [2, 0, 1, 4, 5, 3]] and cosines[0].tolist() == [1, 1, 0, 0, 0, -np.inf]
 
 
 def test_a_row_finds_itself_and_both_directions_work(known: Path, pack: Pack, model: Model) -> None:

@@ -143,8 +143,7 @@ def test_seeds_give_the_t_test_over_seeds_and_equal_ones_are_paired() -> None:
     theirs = [record([2] * 30, 0), record([7] * 30, 1)]
     ours = [record([3] * 30, 0), record([8] * 30, 1)]
     assert paired_difference(ours, theirs)[1:3] == pytest.approx((0.1, 0.1))
-    others = [{**r, "seed": r["seed"] + 5} for r in ours]
-    assert paired_difference(others, theirs)[1] < 0
+    assert paired_difference([{**r, "seed": r["seed"] + 5} for r in ours], theirs)[1] < 0
 
 
 def test_one_seed_has_no_p() -> None:

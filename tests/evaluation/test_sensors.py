@@ -52,8 +52,7 @@ def test_models_keep_sensors_of_their_training_rows(smoke_run: Path, pack: Pack,
     assert load_run(smoke_run)[1]["data"]["sensors"] == ["toy"]
     for modality, known in (("touch", ("negative", "plain", "toy")), ("vision", ("negative", "plain"))):
         init = Init(path=smoke_run, modalities=(modality,))
-        run = smoke(others, steps=1, init=init, eval_every=1)
-        started = train(run, tmp_path / modality, quiet=True)
+        started = train(smoke(others, steps=1, init=init, eval_every=1), tmp_path / modality, quiet=True)
         assert load(started).spec.sensors == load(started, "best").spec.sensors == known
     assert pack.spec.sensors == ()
     model = load(smoke_run)

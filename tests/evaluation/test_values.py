@@ -63,10 +63,9 @@ def test_r2_is_the_same_in_any_unit(unit: float) -> None:
 
 def test_the_interval_of_r2_holds_it_and_a_worse_method_is_told_apart() -> None:
     y, guess, groups = drawn(600)
-    noise = np.random.default_rng(2).normal(0, 1, y.shape)
     good, bad = (
         [{**score_values(y, g + shift, groups, POSE), "seed": seed} for seed, shift in enumerate((0.0, 0.01))]
-        for g in (guess, guess + noise)
+        for g in (guess, guess + np.random.default_rng(2).normal(0, 1, y.shape))
     )
     mean, low, high = interval(good[:1])
     assert low < mean < high < 1 and mean == pytest.approx(r2_score(y, guess))
@@ -84,8 +83,7 @@ def test_error_by_range_finds_where_predictions_are_wrong() -> None:
 
 
 def test_ridge_finds_a_linear_relation_in_any_unit_and_skips_what_was_not_measured() -> None:
-    rng = np.random.default_rng(0)
-    x = rng.normal(0, (1, 100, 0.01), (400, 3))
+    x = np.random.default_rng(0).normal(0, (1, 100, 0.01), (400, 3))
     y = x @ np.array([[2000.0, 0.001], [3.0, 0], [0, 0.4]]) + [1e5, 0]
     y[:200, 1] = np.nan
     predict, alphas = fit_ridge(x[:300], y[:300], 60)
@@ -162,8 +160,7 @@ def test_probes_of_classes_and_values_side_by_side(measured: Pack, tmp_path: Pat
     assert result["targets"]["both"] == [{"name": "level", "unit": "levels"}, {"name": "weight", "unit": "N"}]
     assert found["light", "mvitac", "touch", "linear"]["r2"] > 0.4  # brightness survives any trunk
     assert found["light", "pixels", "touch", "linear"]["r2"] > 0.9
-    assert found["light", "mean", "none", "linear"]["r2"] <= 0
-    assert ("light", "noise only", "none", "linear") in found
+    assert found["light", "mean", "none", "linear"]["r2"] <= 0 and ("light", "noise only", "none", "linear") in found
     assert ("light", "mvitac", "touch", "knn") in found and ("light", "mvitac", "touch", "paper") not in found
     assert ("pattern", "mvitac", "touch", "paper") in found and ("pattern", "mean", "none", "linear") not in found
     shown = result["summary"]["light"]["touch"]["mvitac"]["mean"]

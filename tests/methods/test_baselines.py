@@ -100,8 +100,7 @@ def test_cmc_equals_a_direct_transcription(softmax: bool) -> None:
         assert float(found["loss"].detach()) == pytest.approx(total, rel=1e-4)
         method.after_step(0.5)
         for modality, bank in method.banks.items():
-            moved = (bank.values != banks[modality]).any(dim=1).nonzero().flatten().tolist()
-            assert moved == sorted(at)
+            assert (bank.values != banks[modality]).any(dim=1).nonzero().flatten().tolist() == sorted(at)
             new = unit(0.5 * banks[modality][at] + 0.5 * torch.tensor(z[modality]))
             torch.testing.assert_close(bank.values[at], torch.tensor(new), rtol=1e-4, atol=1e-5)
 
@@ -205,8 +204,7 @@ def test_without_negatives_nothing_collapses(pack: Pack, tmp_path: Path, method:
     """30 steps of the tiny trunk: unseen touches stay apart (a collapsed trunk has spread 0)."""
     run = with_method(smoke(pack, steps=30, batch_size=30, eval_every=0, optim=Optim(name="adamw", lr=2e-3)), method)
     run = replace(run, method=replace(run.method, momentum=0.95, hidden=64))
-    model = load(train(run, tmp_path / "r", quiet=True))
-    z = pack_features(model, pack, "touch", pack.rows("test", "val"))
+    z = pack_features(load(train(run, tmp_path / "r", quiet=True)), pack, "touch", pack.rows("test", "val"))
     assert spread(z - z.mean(0)) > 0.3
 
 
@@ -245,8 +243,7 @@ def test_vicreg_terms_are_their_definitions() -> None:
     cov = [[sum((r[j] - mean[j]) * (r[k] - mean[k]) for r in rows) / 5 for k in range(4)] for j in range(4)]
     v = sum(max(0.0, 1 - math.sqrt(cov[j][j] + 1e-4)) for j in range(4)) / 4
     c = sum(cov[j][k] ** 2 for j in range(4) for k in range(4) if j != k) / 4
-    assert float(variance(z)) == pytest.approx(v, rel=1e-4)
-    assert float(covariance(z)) == pytest.approx(c, rel=1e-4)
+    assert float(variance(z)) == pytest.approx(v, rel=1e-4) and float(covariance(z)) == pytest.approx(c, rel=1e-4)
 
 
 def test_vicreg_weighs_its_terms() -> None:
@@ -309,5 +306,4 @@ def test_the_own_classifier_is_scored_on_views_of_the_side_it_learned_from(pack:
 def test_prototypes_start_with_the_owners_norm() -> None:
     """weight_norm of torch's Linear(256, K): rows uniform in +-1/16, of norm sqrt(256 / 3) / 16."""
     expected = torch.nn.Linear(256, 4096, bias=False).weight.norm(dim=1).mean().item()
-    found = Prototypes(8, 16, 4096).directions.norm(dim=1).mean().item()
-    assert found == pytest.approx(expected, rel=0.01)
+    assert Prototypes(8, 16, 4096).directions.norm(dim=1).mean().item() == pytest.approx(expected, rel=0.01)

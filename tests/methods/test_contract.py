@@ -93,8 +93,7 @@ def test_encoders_and_projectors_fit(name: str) -> None:
         assert head(features[modality]).shape[0] == 8
     assert len(method.projectors()) in (0, 2)
     for task, classifier in method.classifiers().items():
-        joined = torch.cat(list(features.values()), dim=1)
-        assert classifier(joined).shape == (8, {"pattern": 3, "bright": 2}[task])
+        assert classifier(torch.cat(list(features.values()), dim=1)).shape == (8, {"pattern": 3, "bright": 2}[task])
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -105,8 +104,7 @@ def test_one_modality_works_or_is_refused(name: str) -> None:
             build(name, spec)
         return
     method = build(name, spec)
-    assert torch.isfinite(outcome(method, views(method, vision=0))["loss"])
-    assert set(method.encoders()) == {"touch"}
+    assert torch.isfinite(outcome(method, views(method, vision=0))["loss"]) and set(method.encoders()) == {"touch"}
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -126,8 +124,7 @@ def test_a_recipe_changes_every_method_alike_and_each_survives_its_record(pack: 
     run = smoke(pack)
     for name in NAMES:
         method = with_method(run, name).method
-        assert method.name == name
-        assert from_json(MethodConfig, json.loads(json.dumps(to_json(method)))) == method
+        assert method.name == name and from_json(MethodConfig, json.loads(json.dumps(to_json(method)))) == method
         usual = default(MethodConfig, name)
         for field, value in {"hidden": 32, "out": 16}.items():
             assert getattr(method, field, value) == value

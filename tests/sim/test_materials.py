@@ -58,8 +58,7 @@ def test_the_held_out_sensor_is_never_drawn_otherwise():
     seen = {touch(0, c, 0, 0, size=16)["sensor"] for c in range(len(CLASSES))}
     assert len(seen) >= 3 and all(not SENSORS[name].held_out for name in seen)
     pair = touch(0, 0, 0, 0, size=16, sensors=[SENSORS["slim"]])
-    assert SENSORS[pair["sensor"]].held_out
-    assert (pair["vision"] == touch(0, 0, 0, 0, size=16)["vision"]).all()
+    assert SENSORS[pair["sensor"]].held_out and (pair["vision"] == touch(0, 0, 0, 0, size=16)["vision"]).all()
 
 
 def test_difference_images_are_of_the_same_sensor_before_contact():
@@ -120,8 +119,7 @@ def test_measuring_the_contact_changes_no_picture():
     assert np.array_equal(one.touch, other.touch) and np.array_equal(one.vision, other.vision)
     new = {target.name: target.unit for task in measured.source().spec().values[1:] for target in task.targets}
     assert new == {"depth_mm": "mm", "contact_x_mm": "mm", "contact_y_mm": "mm", "patch_mm2": "mm2"}
-    assert other.columns.keys() - one.columns.keys() == set(new)
-    assert {**other.columns, **one.columns} == other.columns
+    assert other.columns.keys() - one.columns.keys() == set(new) and {**other.columns, **one.columns} == other.columns
 
 
 @pytest.mark.parametrize("sensor", [*SENSORS.values()], ids=lambda s: s.name)
@@ -153,8 +151,7 @@ def test_every_relief_has_unit_height_and_the_skewness_asked_for(kind):
 def test_the_fast_lattice_is_the_plain_formula_bit_for_bit():
     """The generator is frozen: whoever makes it faster may not change a pixel."""
     table = draw_tables(np.random.default_rng(1))[0]
-    rng = np.random.default_rng(2)
-    u, v = rng.uniform(-200, 200, (2, 90, 70)).astype(np.float32)
+    u, v = np.random.default_rng(2).uniform(-200, 200, (2, 90, 70)).astype(np.float32)
     i, j = np.floor(u).astype(int), np.floor(v).astype(int)
     a, b = u - np.floor(u), v - np.floor(v)
     a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
@@ -187,8 +184,7 @@ def test_random_sensors_lie_round_the_known_ones_and_not_on_the_held_out_one():
     angles = np.array([[np.arctan2(y, x) for x, y in s.response] for s in drawn])
     apart = np.sort(np.mod(angles - angles[:, :1], 2 * np.pi)[:, 1:], axis=1)
     assert (np.abs(apart - [2 * np.pi / 3, 4 * np.pi / 3]) <= 0.8).all()  # LEDs from three sides, in either order
-    order = np.mod(angles[:, 1] - angles[:, 0], 2 * np.pi) < np.pi
-    assert 0.4 < order.mean() < 0.6
+    assert 0.4 < (np.mod(angles[:, 1] - angles[:, 0], 2 * np.pi) < np.pi).mean() < 0.6
     slim = np.array(SENSORS["slim"].response)
     nearest = min(np.linalg.norm(np.array(s.response) - slim) / np.linalg.norm(slim) for s in drawn)
     assert nearest > 0.05  # no copy of it among the first 300
@@ -209,8 +205,7 @@ def test_one_press_through_two_sensors_shares_the_imprint_alone():
 
     options = {"size": 48, "sensors": one, "background": True}
     here, again = (shape(touch(0, 4, 1, 0, through=number, **options)) for number in (0, 1))
-    other = shape(touch(0, 4, 1, 1, **options))
-    assert np.corrcoef(here, again)[0, 1] > 0.8 > 0.4 > np.corrcoef(here, other)[0, 1]
+    assert np.corrcoef(here, again)[0, 1] > 0.8 > 0.4 > np.corrcoef(here, shape(touch(0, 4, 1, 1, **options)))[0, 1]
     with pytest.raises(ValueError, match="there are 4 sensors"):
         touch(0, 4, 1, 0, size=48, through=4)
 

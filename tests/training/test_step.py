@@ -74,8 +74,7 @@ def test_gradient_caching_is_exact_without_batchnorm_statistics(config: MethodCo
     run = replace(RUN, method=config, encoder=TINY_VIT if config.needs_vit else RUN.encoder)
     direct, cached = build(run, norm=False), build(run, norm=False)
     a = take(run, direct, [lambda: views()])
-    b = take(run, cached, split(views(), size))
-    assert_close(a, b, 1e-5)
+    assert_close(a, take(run, cached, split(views(), size)), 1e-5)
     assert_close(gradients(direct), gradients(cached), 1e-4)
     remembered = [
         {k: v for k, v in m.state_dict().items() if k.startswith(("banks", "queues", "centre"))}
@@ -101,8 +100,7 @@ def test_gradient_caching_is_exact_with_batchnorm_and_dropout_chunk_by_chunk() -
     found = take(RUN, cached, parts)
     assert_close({n: v.detach() for n, v in losses.items()}, found, 1e-5)
     assert_close(gradients(direct), gradients(cached), 1e-4)
-    counts = {name: int(b) for name, b in cached.query.named_buffers() if "num_batches" in name}
-    assert set(counts.values()) == {3}
+    assert {int(b) for name, b in cached.query.named_buffers() if "num_batches" in name} == {3}
     for name, buffer in direct.query.named_buffers():
         torch.testing.assert_close(buffer, dict(cached.query.named_buffers())[name])
 

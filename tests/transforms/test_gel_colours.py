@@ -16,8 +16,7 @@ FAR = np.array([[-55.0, 10.0], [25.0, 60.0], [35.0, -50.0]])
 
 def slopes(num: int = 48, size: int = 40, seed: int = 0) -> np.ndarray:
     """Slopes [num, size, size, 2] of heights with sharp ridges and smooth valleys, as a membrane shows them."""
-    noise = np.random.default_rng(seed).normal(size=(num, size, size))
-    height = -np.abs(gaussian_filter(noise, (0, 5, 5)))
+    height = -np.abs(gaussian_filter(np.random.default_rng(seed).normal(size=(num, size, size)), (0, 5, 5)))
     g = np.stack([np.gradient(height, axis=2), np.gradient(height, axis=1)], axis=-1)
     return g / g.std() / 4
 
@@ -50,8 +49,7 @@ def test_sign_and_factor_come_from_the_gel() -> None:
     """Ridges stay ridges: also for colours of opposite sign, and whatever the brightness of the LEDs."""
     plain, opposite, bright = (learn_colours(images(c, slopes(), 1)) for c in (NEAR / 2, -NEAR / 2, NEAR))
     for learned, truth in ((plain, NEAR), (opposite, -NEAR), (bright, NEAR)):
-        cosine = (learned.colours * truth).sum() / np.linalg.norm(learned.colours) / np.linalg.norm(truth)
-        assert cosine > 0.98
+        assert (learned.colours * truth).sum() / np.linalg.norm(learned.colours) / np.linalg.norm(truth) > 0.98
         np.testing.assert_allclose(learned.mixtures.T @ learned.colours, np.eye(2), atol=1e-6)  # there and back
     assert np.linalg.norm(bright.colours) / np.linalg.norm(plain.colours) == pytest.approx(2, rel=0.1)
     g = (images(NEAR, slopes(), 1) - images(NEAR, slopes() * 0, 1).astype(float)) @ bright.mixtures
@@ -88,7 +86,6 @@ def test_colours_of_exact_slopes() -> None:
     dots = gaussian_filter(np.random.default_rng(0).standard_normal(heights.shape), (0, 1, 1))[..., None] * ink
     colours, mixtures, curl = slope_colours(np.stack([gx, gy], -1) @ response.T + dots)
     assert curl < 0.01
-    factor = colours[0, 0] / response[0, 0]
-    np.testing.assert_allclose(colours / factor, response, atol=2)
+    np.testing.assert_allclose(colours / (colours[0, 0] / response[0, 0]), response, atol=2)
     np.testing.assert_allclose(mixtures.T @ colours, np.eye(2), atol=1e-6)
     assert np.abs(mixtures.T @ ink).max() < 0.03 * np.abs(mixtures.T @ response).max()

@@ -68,8 +68,7 @@ def test_statistics_of_the_paper() -> None:
     """Area uniform in .2-1 (where the crop fits), ratio within 3/4-4/3, flips .5, grayscale .2."""
     drawn = draw(ViewAugment(), 20000, 256, generator())
     top, left, height, width = drawn.boxes.T
-    assert (top >= 0).all() and (left >= 0).all()
-    assert (top + height <= 256).all() and (left + width <= 256).all()
+    assert (top >= 0).all() and (left >= 0).all() and (top + height <= 256).all() and (left + width <= 256).all()
     area, ratio = height * width / 256**2, width / height
     assert 0.19 < float(area.min()) < 0.22 and 0.95 < float(area.max()) <= 1
     assert float(ratio.min()) > 0.73 and float(ratio.max()) < 1.37
@@ -85,6 +84,5 @@ def test_grayscale_makes_channels_equal_before_normalisation() -> None:
 
 def test_stacked_sensors_move_together() -> None:
     raw = images()
-    stacked = torch.cat([raw, raw], dim=1)
-    together = random_view(stacked, ViewAugment(jitter=0.3), 24, generator())
+    together = random_view(torch.cat([raw, raw], dim=1), ViewAugment(jitter=0.3), 24, generator())
     assert torch.equal(together[:, :3], together[:, 3:])
