@@ -117,8 +117,7 @@ def locked(data: DatasetConfig, phased: bool) -> Run:
     Touch starts from random weights: from ImageNet it loses fine texture. Its trunk is `quick`'s without the last stage,
     read from all its stages. Chosen on val, too: lambda_inter 2; and at 44 px instead of 48 a weight decay of 3 (900 steps:
     category by both 74.2, rough 92.6, R@5 27.0; of 1 70.7, 91.6, 25.8; of 1e-4 69.7, 89.3, 25.0; of 10 65.8, 85.9, 14.7).
-    So 700 steps reach what 900 of 1e-4 at 48 px do (seed 1: 72.3, 93.6, 23.4 and 72.1, 91.0, 23.5). For `quick`, whose
-    camera tower learns, too, a decay of 3 is wrong: 41.6 instead of 49.6, force 43.5 instead of 62.0.
+    For `quick`, whose camera tower learns, too, a decay of 3 is wrong: 41.6 for 49.6, force 43.5 for 62.0.
     """
     base = quick(data, phased)
     whole = ViewAugment(scale=(1.0, 1.0), flip=0.0, grayscale=0.0, size=128)

@@ -173,7 +173,7 @@ def test_columns_of_episodes_are_ours(tmp_path: Path) -> None:
     path = demos(tmp_path, **{"data/demo_1/demo": np.arange(5)})
     table = read_arrays(path, [path], ("obs/camera",), ())
     assert {row["demo"] for row in table.rows} == {f"data/demo_{k}" for k in range(4)}
-    assert table.notes == ("demo of demos.hdf5 is left out, this column is ours: rename it",)
+    assert table.notes == ("demo of demos.hdf5 is left out, ours has this name",)
 
 
 def test_what_a_demonstration_lacks(tmp_path: Path) -> None:

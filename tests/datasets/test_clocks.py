@@ -166,7 +166,7 @@ def own_times(name: str, *lines: object) -> Callable[[Path], None]:
     [
         (lambda root: (root / "0/force.csv").rename(root / "force.csv"), r"would be the log of 2 recordings"),
         (spoil(stamp=lambda cell: str(round(1000 * float(cell)) + 97)), r"stamps are 10 s apart, .*: are they seconds"),
-        (spoil(36, Fz=lambda _: "1 N"), r"row 36: Fz is '1 N', which cannot be interpolated"),
+        (spoil(36, Fz=lambda _: "1 N"), r"row 36: Fz is '1 N': give a finite number"),
         (spoil(36, stamp=lambda _: "then"), r"force\.csv, column stamp: 'then' is no time: give seconds"),
         (own_times("txt", *range(30), 20, *range(31, 50)), r"gel_timestamps\.txt: time 31 is before the one above it"),
         (own_times("txt", *range(49), float("nan")), r"gel_timestamps\.txt: 'nan' is no time"),

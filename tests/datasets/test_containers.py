@@ -172,6 +172,11 @@ def test_lerobot_says_what_is_missing(tmp_path: Path) -> None:
     refused(tmp_path / "nowhere", r"info\.json does not exist")
     refused(make_lerobot(tmp_path / "old", version="v1.6"), r"version v1\.6: v2 and v3 are read")
     root = make_lerobot(tmp_path / "set")
+    about = (file := root / "meta/info.json").read_text()
+    for place in (f"{tmp_path}/old/videos/", "../old/videos/"):
+        file.write_text(about.replace('"videos/', f'"{place}'))
+        refused(root, "video_path leads out of the dataset, to ")
+    file.write_text(about)
     (root / f"videos/{GEL}/chunk-000/file-001.mp4").unlink()
     refused(root, r"file-001\.mp4 is missing: fetch the videos too")
     (root / "data/chunk-000/file-001.parquet").write_text("no")

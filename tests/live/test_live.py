@@ -379,10 +379,11 @@ def test_a_full_disk_ends_the_recording_only(tmp_path: Path, monkeypatch: pytest
             monkeypatch.setattr("mvitac.live.recorder.write_atomic", full)
         recorder({"touch": image}, {"time": float(i), "contact": True, "touch_number": 1})
     assert len(said) == 1 and re.search("recording stopped, prediction goes on: .*No space left", said[0])
-    with pytest.raises(OSError, match="No space"):
+    monkeypatch.setattr("mvitac.live.recorder.build", lambda *given, **options: full(tmp_path, None))
+    with pytest.raises(ValueError, match=r"No space.*: 64 pairs are kept in .*out\.spool, make room .* python -c"):
         recorder.close()
     monkeypatch.undo()
-    assert recorder.close() == Pack(tmp_path / "out").num == 128  # as many as were kept until then
+    assert recorder.close() == Pack(tmp_path / "out").num == 128 and len(said) == 1  # as many as were kept until then
 
 
 def test_a_recording_survives_a_crash(tmp_path: Path) -> None:
@@ -442,6 +443,8 @@ def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys:
     lines = [json.loads(line) for line in said.splitlines()]
     assert "has no more frames" in faults and '"frames": 24' in faults
     assert len(lines) >= summary["predictions"] >= 1 and all(line["time"] < 60 for line in lines)
+    assert main([*command, "--calibration", "25"]) == 0
+    assert "contact was never known: no 25 frames without it" in capsys.readouterr().err
     touched = [line for line in lines if line["contact"]]
     assert touched[0]["touch"] == 1 and touched[0]["pattern"]["class"] in ("columns", "rows", "checks")
     assert [line["time"] for line in lines] == sorted({line["time"] for line in lines})

@@ -170,7 +170,7 @@ def problems(value: dict[str, Any]) -> list[str]:
 
 
 def unknown_fields(value: dict[str, Any], parts: Sequence[tuple[dict[str, Any], Sequence[str]]]) -> Iterator[str]:
-    """What nobody reads: fields of each of ``parts`` and of what all results have."""
+    """Fields of ``parts``, and of what all results have, that nobody reads."""
     encoder = value["encoder"]
     shared = (value.get("about", {}), ABOUT), (encoder, ENCODER), (encoder.get("external", {}), EXTERNAL)
     for fields, known in (*shared, *parts):

@@ -14,6 +14,7 @@ A sample is a pair: both cameras at the time of a table row. From a video, the f
 used, so cameras may have different rates. If it is farther away than ``tolerance``, the image is missing.
 """
 
+import os
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -116,6 +117,8 @@ class LeRobotConfig(RecordedConfig):
             place |= {"episode_index": number, "episode_chunk": number // info.get("chunks_size", 1000)}
             with fields_of(where):
                 file = self.path / info["video_path"].format(video_key=key, **place)
+                if not Path(os.path.normpath(file)).is_relative_to(os.path.normpath(self.path)):
+                    raise ValueError(f"video_path leads out of the dataset, to {file}")
                 start, end = episode[f"videos/{key}/from_timestamp"], episode.get(f"videos/{key}/to_timestamp")
                 low, high = start - 1e-3, (np.inf if end is None else end) - 1e-3
             used.setdefault(file, []).append((low, high, name))

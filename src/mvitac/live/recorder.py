@@ -15,16 +15,13 @@ import numpy as np
 from mvitac.data.build import build
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec
-from mvitac.system.files import check_place, digest_file, write_atomic
+from mvitac.system.files import brief, check_place, digest_file, write_atomic
 
 SPOOL = 64  # pairs per file of the spool: the number that a crash can lose
 
 
 class Recorder:
-    """Call it with every pair; ``close`` makes the pack. At most ``fps`` pairs per second are kept.
-
-    Recording ends when pairs cannot be written (a full disk); ``tell`` gets a sentence, and prediction goes on.
-    """
+    """Call it with every pair; at most ``fps`` per second are kept. A full disk ends it, and ``tell`` gets a sentence."""
 
     def __init__(self, out: Path, *, fps: float = 10, sensor: str = "", tell: Callable[[str], object] = print) -> None:
         """Record into the new folder ``out``; ``sensor`` is the touch sensor's name, if it is known (column sensor)."""
@@ -35,8 +32,8 @@ class Recorder:
         self.named = {"sensor": sensor} if sensor else {}
         self.spool = _spool(out)
         if self.spool.exists():
-            how = f'python -c "from mvitac.live.recorder import finish; finish({str(out)!r})"'
-            raise ValueError(f"{self.spool} is of a recording that still runs, or crashed and is finished by {how}")
+            still = "is of a recording that still runs, or crashed and is finished by"
+            raise ValueError(f"{self.spool} {still} {_command(out)}")
         self.spool.mkdir(parents=True)
         self.waiting: list[tuple[dict[str, np.ndarray], dict[str, Any]]] = []
         self.num = 0
@@ -54,11 +51,7 @@ class Recorder:
             self._next = time + self.every
         self.waiting.append((images, {**columns, **self.named}))
         if len(self.waiting) == SPOOL:
-            try:
-                self._flush()
-            except OSError as error:
-                self.failed = True
-                self.tell(f"recording stopped, prediction goes on: {error.filename}: {error.strerror}")
+            self._flush()
 
     def _flush(self) -> None:
         if not self.waiting:
@@ -68,14 +61,28 @@ class Recorder:
         columns = {f"column_{name}": np.array([row[name] for row in rows]) for name in rows[0]}
         buffer = io.BytesIO()
         np.savez(buffer, **arrays, **columns)  # type: ignore[arg-type]
-        write_atomic(self.spool / f"{self.num:08d}.npz", lambda file: file.write(buffer.getvalue()))
+        try:
+            write_atomic(self.spool / f"{self.num:08d}.npz", lambda file: file.write(buffer.getvalue()))
+        except OSError as error:
+            if not self.failed:
+                self.tell(f"recording stopped, prediction goes on: {error.filename}: {error.strerror}")
+            self.failed = True
+            return
         self.num += len(self.waiting)
         self.waiting = []
 
     def close(self) -> int:
-        """Write the last pairs and make the pack; returns its number of pairs (0: nothing is made)."""
+        """Write the last pairs and make the pack; returns its number of pairs (0: none). ValueError: they stay."""
         self._flush()
-        return finish(self.out)
+        try:
+            return finish(self.out)
+        except (OSError, ValueError) as error:
+            kept = f"{self.num} pairs are kept in {self.spool}, make room and finish them by"
+            raise ValueError(f"{brief(error)}: {kept} {_command(self.out)}") from None
+
+
+def _command(out: Path) -> str:
+    return f'python -c "from mvitac.live.recorder import finish; print(finish({str(out)!r}), {"pairs"!r})"'
 
 
 def _spool(out: Path) -> Path:

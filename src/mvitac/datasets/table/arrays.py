@@ -61,10 +61,7 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
                 num = len(next(iter(refs.values())))
                 cells = _constants(opened, name, vectors)
                 cells |= _columns(demo, datasets, num, refs, vectors, left_out)
-                taken = {*OWN} & {*cells}
-                notes |= {
-                    f"{column} of {file.name} is left out, this column is ours: rename it": None for column in taken
-                }
+                notes |= {f"{c} of {file.name} is left out, ours has this name": None for c in OWN if c in cells}
                 notes |= dict.fromkeys(_unwritten(file, {n: d for n, d in datasets.items() if n in {**refs, **cells}}))
                 episodes = _episodes(demo, everything.get("meta/episode_ends"), num)
                 for column in {**found, **refs}:

@@ -210,5 +210,5 @@ def _number(log: Manifest, i: int, name: str) -> float:
     cell = log.rows[i][name]
     value = number_of(cell) if cell else math.nan
     if value is None:
-        raise ValueError(f"{log.at(i)}: {name} is {cell!r}, which cannot be interpolated: --data.interpolate nearest")
+        raise ValueError(f"{log.at(i)}: {name} is {cell!r}: give a finite number (a field of a message), or nothing")
     return value
