@@ -173,7 +173,7 @@ def test_export_and_live_of_windows(
     with pytest.raises(ValueError, match="touch: expected uint8"):
         engine(vision=images["vision"], touch=images["touch"][..., :3])
     for vision in (images["vision"][:1], images["vision"][:0]):
-        with pytest.raises(ValueError, match=f"got {len(vision)} of vision and 2 of touch: give some of each"):
+        with pytest.raises(ValueError, match=f"got {len(vision)} of vision and 2 of touch: give as many"):
             engine(vision=vision, touch=images["touch"])
     command = ["live", str(out), *film(measured, tmp_path, rest=4, num=10, fps=30)]
     capsys.readouterr()

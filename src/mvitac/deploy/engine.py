@@ -121,7 +121,8 @@ class Engine:
             if value.dtype != np.uint8 or value.ndim != 4 or value.shape[1:] != shape:
                 raise ValueError(f"{name}: expected uint8 [B, {shape}], got {value.dtype} {value.shape}")
         if len(sizes := {len(value) for value in images.values()}) > 1 or 0 in sizes:
-            raise ValueError(f"got {' and '.join(f'{len(v)} of {m}' for m, v in images.items())}: give some of each")
+            given = " and ".join(f"{len(value)} of {name}" for name, value in images.items())
+            raise ValueError(f"got {given}: give as many of each, and at least one")
         found = self._call([np.ascontiguousarray(images[m]) for m in self.inputs])
         return dict(zip(self.meta["outputs"], found, strict=True))
 
