@@ -106,7 +106,7 @@ class Model(nn.Module):
         """
         result = {}
         for modality, images in self._named(vision=vision, touch=touch).items():
-            check_images(images, self.spec.channels(modality), modality)
+            images = check_images(images, self.spec.channels(modality), modality)
             features = self._encode(modality, resized(images, self.stored), shared)
             result[modality] = self._project(modality, features) if shared else features
         return result
@@ -171,7 +171,7 @@ class Model(nn.Module):
                 training views (``Augment.size``), while probes see them at ``Augment.whole``.
             bf16: Compute in bf16.
         """
-        check_images(images, self.spec.channels(modality), modality)
+        images = check_images(images, self.spec.channels(modality), modality)
         with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
             return self._encode(modality, images, for_heads)
 

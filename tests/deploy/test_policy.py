@@ -29,6 +29,11 @@ def test_features_are_the_models(model: Model, pack: Pack) -> None:
     wanted = torch.cat([expected["vision"], expected["touch"]], dim=1)
     torch.testing.assert_close(encoder(seen), wanted, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(encoder({k: v / 255 for k, v in seen.items()}), wanted, atol=1e-4, rtol=1e-4)
+    large = {k: v.repeat_interleave(3, 2).repeat_interleave(2, 3).roll(5, 3) for k, v in seen.items()}
+    alike = encoder({k: v / 255 for k, v in large.items()}), model(vision=large[next(iter(KEYS))] / 255)["vision"]
+    embedded = model.embed(vision=large["observation.images.wrist"], touch=large["observation.images.gel"])
+    torch.testing.assert_close(alike[0], torch.cat([embedded["vision"], embedded["touch"]], dim=1), atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(alike[1], embedded["vision"], atol=1e-6, rtol=1e-5)
     history = {k: v[None].expand(4, -1, -1, -1, -1) for k, v in seen.items()}
     torch.testing.assert_close(encoder(history), wanted[None].expand(4, -1, -1), atol=1e-4, rtol=1e-4)
     assert encoder.out_features == wanted.shape[1]
@@ -55,6 +60,11 @@ def test_what_does_not_fit_is_named(model: Model, pack: Pack) -> None:
     encoder, seen = ObservationEncoder(model, KEYS), observe(pack, [0])
     not_divided = {k: v.float() for k, v in seen.items()}
     normalised_already = {k: (v / 255 - 0.45) / 0.22 for k, v in seen.items()}
-    for wrong in (not_divided, normalised_already):
-        with pytest.raises(ValueError, match=r"expected floats in \[0, 1\] or uint8"):
-            encoder(wrong)
+    nan, last = ({k: f(v) for k, v in seen.items()} for f in (lambda v: v * torch.nan, lambda v: v.movedim(1, -1)))
+    for _ in range(2):  # also after a batch that was right
+        for wrong in (not_divided, normalised_already, nan, last):
+            with pytest.raises(ValueError, match=r"expected .*float"):
+                encoder(wrong)
+        with pytest.raises(ValueError, match=r"gel: .* does not fit images of \[1, 3, "):
+            encoder({**seen, "observation.images.gel": seen["observation.images.gel"].repeat(2, 1, 1, 1)})
+        encoder(seen)

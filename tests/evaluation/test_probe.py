@@ -452,3 +452,4 @@ def test_the_untrained_trunk_is_of_the_runs_own_data(tmp_path: Path) -> None:
     pack.spec, own = replace(pack.spec, tasks=pack.spec.tasks[:1]), Toy().spec()
     records, retrieval = controls_of(runs, pack, pack.spec.tasks, ["touch"], ["knn"], specs=[own, own])
     assert {r["seed"] for r in records if r["source"] == "untrained"} == {0, 1} and not retrieval
+    assert {r["probe"] for r in records if r["source"] in ("pixels", "border")} == {"knn"}

@@ -67,19 +67,19 @@ def controls_of(
 ) -> tuple[Records, Records]:
     """Score every control for ``runs``: probe records and retrieval records, each with its "source" and "seed".
 
-    ``probes`` are those of the trunks; all other controls get logistic regression. ``specs``: what the runs were trained
-    on, where that is not ``pack``. ``standardise``: as for the runs (``sensors.touch_features``), for the trunks.
+    Each gets the same ``probes``. ``specs``: what the runs were trained on, where that is not ``pack``. ``standardise``:
+    as for the runs (``sensors.touch_features``), for the trunks.
     """
-    records = label_controls(pack, tasks, modalities)
+    records = label_controls(pack, tasks, modalities, probes)
     starts, weights = starts_of(runs, specs or [pack.spec] * len(runs)), frozen_trunks(runs)
-    fitted = sum(len(probes_of(task, probes)) for task in tasks) * (len(starts) + len(weights))
-    num = len(modalities) * (len(tasks) + fitted) + len(tasks) * ("touch" in modalities)
+    sources = len(modalities) * (1 + len(starts) + len(weights)) + ("touch" in modalities)
+    num = sources * sum(len(probes_of(task, probes)) for task in tasks)
 
     def probed(model: Model, which: Sequence[str] = modalities) -> Records:
         return probe_model(model, pack, tasks, which, probes, standardise)
 
     with work("fitting probes of the controls", num, "probes"):
-        records += pixel_controls(pack, tasks, modalities)
+        records += pixel_controls(pack, tasks, modalities, probes)
         # Built one by one: threads would share the random generator.
         models = [fresh(_untrained(run, runs), spec, pack.size) for run, spec in starts]
         retrieval: Records = []
@@ -109,10 +109,12 @@ def _named(source: str, seed: int | None, found: Records) -> Records:
     return [{"source": source, "seed": seed, **record} for record in found]
 
 
-def label_controls(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str] = ()) -> Records:
+def label_controls(
+    pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str] = (), probes: Sequence[str] = ("linear",)
+) -> Records:
     """What needs no image: the most common class or the mean value, and the dataset's own controls (table columns).
 
-    Where rows lack images, also on the rows of each of ``modalities``.
+    Where rows lack images, also on the rows of each of ``modalities``. Of values, a column gets one curve.
     """
     records = []
     for task, modality in [(t, m) for t in tasks for m in ("none", *seen_by(pack, t, modalities))]:
@@ -123,23 +125,26 @@ def label_controls(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[st
             answer = np.eye(len(task.classes))[np.bincount(pack.labels(task.name)[rows.fitted]).argmax()]
         else:
             answer = np.nanmean(pack.values(task)[rows.fitted], axis=0)
-        guess, kind = ("majority", "linear") if isinstance(task, Task) else ("mean", "curve")
-        found = {guess: score_rows(pack, task, rows.test, np.tile(answer, (len(rows.test), 1)))}
+        guess, kinds = ("majority", probes_of(task, probes)) if isinstance(task, Task) else ("mean", ["curve"])
+        found = [(guess, "linear", score_rows(pack, task, rows.test, np.tile(answer, (len(rows.test), 1))))]
         for name, columns in pack.spec.controls.items():
             x = np.stack([pack.column(column).astype(float) for column in columns], axis=1)
             if np.isfinite(x[whole]).all():  # else rows of a part of a mix that has no such control
-                found[name], _ = probe_features(x[rows.all], pack, task, rows, kind, 0)
-        for name, result in found.items():
-            records += _named(name, None, [{"task": task.name, "modality": modality, "probe": "linear", **result}])
+                found += [(name, k, probe_features(x[rows.all], pack, task, rows, k, 0)[0]) for k in kinds]
+        for name, kind, result in found:
+            known = {"task": task.name, "modality": modality, "probe": "linear" if kind == "curve" else kind}
+            records += _named(name, None, [{**known, **result}])
     return records
 
 
-def pixel_controls(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> Records:
+def pixel_controls(
+    pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str], probes: Sequence[str] = ("linear",)
+) -> Records:
     """Thumbnails of every modality, and the border of the tactile image."""
-    found = probe_all(partial(thumbnails, pack), pack, tasks, modalities, ["linear"], 0)
+    found = probe_all(partial(thumbnails, pack), pack, tasks, modalities, probes, 0)
     records = _named("pixels", None, found)
     if "touch" in modalities:
-        found = probe_all(partial(borders, pack), pack, tasks, ["touch"], ["linear"], 0)
+        found = probe_all(partial(borders, pack), pack, tasks, ["touch"], probes, 0)
         records += _named("border", None, found)
     return records
 

@@ -137,16 +137,22 @@ def check_range(low: float, high: float, dtype: Any, what: str) -> None:
         raise ValueError(f"{what}: expected floats in [0, 1] or uint8, {got}: the model normalises images itself")
 
 
-def check_images(images: Tensor, channels: int, what: str) -> None:
-    """Raise ValueError unless ``images`` is [B, channels, H, W], uint8 or float in [0, 1]."""
+def check_images(images: Tensor, channels: int, what: str, *, values: bool = True) -> Tensor:
+    """Return ``images`` [B, channels, H, W] as `embed` sees them: uint8, but floats in [0, 1] that need gradients.
+
+    ValueError if they are others. Without ``values`` their range is not checked: that makes a GPU wait.
+    """
     known = isinstance(images, Tensor) and (images.dtype == torch.uint8 or images.is_floating_point())
     if not known or images.ndim != 4 or images.shape[1] != channels or not images.numel():
         shown = f"{images.dtype} {list(images.shape)}" if isinstance(images, Tensor) else type(images).__name__
         asked = f"expected a tensor [B, {channels}, H, W], uint8 or float in [0, 1]"
         raise ValueError(f"{what}: {asked}, got {shown} (`embed` takes any image)")
-    if images.dtype != torch.uint8:
+    if images.dtype == torch.uint8:
+        return images
+    if values:
         low, high = images.detach().aminmax()
         check_range(float(low), float(high), images.dtype, what)
+    return images if images.requires_grad else (images.float().clip(0, 1) * 255).round().to(torch.uint8)
 
 
 def resized(images: Tensor, side: int) -> Tensor:
