@@ -518,6 +518,9 @@ def test_bad_options_are_named_at_once(options: dict[str, Any], says: str) -> No
 
 BAD_FILES: dict[str, tuple[str, bytes, str]] = {
     "ragged": ("m.csv", b"vision,touch\na,b\na,b,c\n", "row 2 has 3 cells for 2 columns"),
+    "open quote": ("m.csv", b'vision,touch\na,b\na,"b\na,b\n', "unexpected end of data"),
+    "two open quotes": ("m.csv", b'vision,touch\na,b\na,"b\na,"b\n', "expected after"),
+    "swallowed row": ("m.csv", b'vision,touch\na,"b\na,b"\n', "row 1 has a line break in a cell"),
     "header twice": ("m.csv", b"vision,vision\na,b\n", "two columns of one name"),
     "key twice": ("m.jsonl", b'{"vision": "a", "touch": "b", "touch": "c"}', "two entries of one name"),
     "latin-1": ("m.csv", "vision,touch\nMöbel,b\n".encode("latin-1"), "cannot be read as a table: 'utf-8' codec"),

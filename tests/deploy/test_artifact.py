@@ -12,7 +12,7 @@ import mvitac
 from mvitac.data.pack import Pack
 from mvitac.deploy.artifact import ARTIFACT, preprocessing
 from mvitac.deploy.card import card
-from mvitac.deploy.publish import publish, with_probes
+from mvitac.deploy.publish import fit_probes, publish, with_probes
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import fitting
 from mvitac.evaluation.probe import split_rows
@@ -78,6 +78,9 @@ def test_difference_images_are_told(smoke_run: Path, pack: Pack, tmp_path: Path)
     minus = copied(pack)
     minus.spec = replace(pack.spec, difference=True)
     assert fitting(found, minus) == ("vision", "touch")
+    for pair in ((mvitac.load(smoke_run), minus), (found, pack)):
+        with pytest.raises(ValueError, match="difference images"):
+            fit_probes(*pair)
 
 
 def test_the_hub_offline_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

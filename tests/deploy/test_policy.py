@@ -32,8 +32,8 @@ def test_features_are_the_models(model: Model, pack: Pack) -> None:
     large = {k: v.repeat_interleave(3, 2).repeat_interleave(2, 3).roll(5, 3) for k, v in seen.items()}
     alike = encoder({k: v / 255 for k, v in large.items()}), model(vision=large[next(iter(KEYS))] / 255)["vision"]
     embedded = model.embed(vision=large["observation.images.wrist"], touch=large["observation.images.gel"])
-    torch.testing.assert_close(alike[0], torch.cat([embedded["vision"], embedded["touch"]], dim=1), atol=1e-6, rtol=1e-5)
-    torch.testing.assert_close(alike[1], embedded["vision"], atol=1e-6, rtol=1e-5)
+    both = torch.cat([embedded["vision"], embedded["touch"]], dim=1)
+    torch.testing.assert_close(alike, (both, embedded["vision"]), atol=1e-6, rtol=1e-5)
     history = {k: v[None].expand(4, -1, -1, -1, -1) for k, v in seen.items()}
     torch.testing.assert_close(encoder(history), wanted[None].expand(4, -1, -1), atol=1e-4, rtol=1e-4)
     assert encoder.out_features == wanted.shape[1]

@@ -157,6 +157,13 @@ def test_a_trunk_of_others_is_a_start_too(pack: Pack, tmp_path: Path, monkeypatc
     assert config == imagenet_trunk(EncoderConfig())
 
 
+def test_a_rate_that_diverges_is_not_chosen(ancestor: Path, pack: Pack, tmp_path: Path) -> None:
+    said: list[str] = []
+    asked = replace(ASKED, lr=(1e12, 1e-3), from_scratch=False)
+    found = tune(ancestor, pack, tmp_path / "out", asked, say=said.append)
+    assert found["chosen"]["100"]["fine-tuned"]["lr"] == 1e-3 and any("diverged" in line for line in said)
+
+
 def tried_in(folder: Path) -> dict[str, float]:
     """Error by settings, without the digest of run and data."""
     tried = read_json(folder / "choice.json", "").items()

@@ -74,18 +74,18 @@ class ObservationEncoder(nn.Module):
 
     def _each(self, observation: Mapping[str, Tensor], network: Callable[[Any, Tensor], Tensor]) -> dict[str, Tensor]:
         """What ``network`` makes of each modality's trunk and normalised images, [B, ...] or [B, T, ...]."""
-        found = {}
+        found, first = {}, observation[next(iter(self.keys.values()))[0]]
+        lead = first.shape[:-3]
         for modality, names in self.keys.items():
             views = []
             for name in names:
                 image = observation[name]
-                first = observation[next(iter(self.keys.values()))[0]]
-                if image.shape[:-3] != first.shape[:-3]:
+                if image.shape[:-3] != lead:
                     raise ValueError(f"{name}: {list(image.shape)} does not fit images of {list(first.shape)}")
                 flat, wait = image.flatten(0, -4), image.is_cpu or name not in self._checked
                 images = check_images(flat, 3, name, values=wait)  # on a GPU, the values of the first only
                 self._checked.add(name)
                 views.append(self._input(modality, resized(images, self.stored)))
             with torch.set_grad_enabled(self.tune and torch.is_grad_enabled()):
-                found[modality] = network(self.encoders[modality], torch.cat(views, dim=1)).float().unflatten(0, first.shape[:-3])
+                found[modality] = network(self.encoders[modality], torch.cat(views, dim=1)).float().unflatten(0, lead)
         return found

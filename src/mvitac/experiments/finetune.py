@@ -37,7 +37,7 @@ from mvitac.registry import from_json
 from mvitac.run import Optim, Run, load_run
 from mvitac.system.files import check_place, digest, read_json, write_json
 from mvitac.system.progress import duration
-from mvitac.training.loop import train
+from mvitac.training.loop import Diverged, train
 from mvitac.training.setup import check_same
 from mvitac.transforms.random_views import Augment, ViewAugment
 
@@ -282,7 +282,11 @@ def _held_out_error(job: _Job, percent: float, kind: str, settings: dict[str, An
     key = digest([run.digest(), job.pack.digest])[:8]
     name = f"{kind}: {', '.join(f'{name} {value}' for name, value in settings.items())} ({key})"
     if name not in tried:
-        train(run, work / key, resume=True, quiet=True, loggers=(job.forecast,), pack=job.pack, validate=False)
+        try:
+            train(run, work / key, resume=True, quiet=True, loggers=(job.forecast,), pack=job.pack, validate=False)
+        except Diverged:
+            job.say(f"{percent:g} %: {name}: diverged")
+            return float("inf")
         learned, model = run.method.training_rows(job.pack), load(work / key)
         held = np.setdiff1d(job.method(percent, 0).training_rows(job.pack), learned)
         found = own_heads(model, job.pack, job.tasks, [job.modality], held)

@@ -153,7 +153,7 @@ def _check_finite(losses: dict[str, float], step: int, run: Run) -> None:
 
 
 def _diverged(what: str, run: Run) -> Diverged:
-    how = f"lower --optim.lr (now {run.optim.lr:g}), add --optim.warmup 0.05, or use --precision fp32"
+    how = f"lower --optim.lr (now {run.optim.lr:g}; --lr of finetune), add --optim.warmup 0.05, or use --precision fp32"
     return Diverged(f"{what}: {how}; the last checkpoint is kept")
 
 

@@ -190,11 +190,13 @@ def _read_csv(file: Path) -> list[dict[str, Any]]:
         header = stream.readline()
         stream.seek(0)
         sign = next((sign for sign in ",;\t" if sign in header), ",")
-        names, *lines = [line for line in csv.reader(stream, delimiter=sign) if line] or [[]]
+        names, *lines = [line for line in csv.reader(stream, delimiter=sign, strict=True) if line] or [[]]
     names = [name.strip() for name in names]
     if len(set(names)) < len(names):
         raise ValueError(f"it has two columns of one name: {', '.join(names)}")
     for number, line in enumerate(lines, 1):
+        if any("\n" in cell or "\r" in cell for cell in line):
+            raise ValueError(f"row {number} has a line break in a cell: close its quotes, or take it out")
         if len(line) != len(names):
             raise ValueError(f"row {number} has {len(line)} cells for {len(names)} columns: quote cells with commas")
     return [dict(zip(names, line, strict=True)) for line in lines]
