@@ -304,6 +304,18 @@ def not_run(block: dict[str, Any], why: str = "no time") -> None:
     block["not_run"] = why
 
 
+def no_vision(value: dict[str, Any]) -> None:
+    """All of the encoder's records with vision are gone, which it says that it reads."""
+    drop(value, source="", modality="both")
+    value["blocks"][0]["left_out"] = {"both": "x"}
+
+
+def simulated(value: dict[str, Any]) -> None:
+    """Of a set that can be made anywhere, nothing was run."""
+    value["suite"]["sets"][2]["forms"][0]["at"] = {}
+    value["suite_digest"] = suite_of(value).digest()
+
+
 def no_touch(value: dict[str, Any]) -> None:
     """One task is left out, as if the encoder had no touch, which other tasks have scores of."""
     del value["encoder"]["parameters"]["touch"]
@@ -340,7 +352,11 @@ FORGED: dict[str, tuple[Change, str]] = {
     "note": (put("blocks", 0, "notes", value=[5]), "a leak mark, a note, a group or what groups are is no text"),
     "clipped": (put(*VALUES, "clipped", value=[9, 4]), "9 of its 4 features were clipped"),
     "excuse": (put("blocks", 0, "left_out", value={"vision": NO_VISION}), NO_VISION),
-    "excuse of a lost encoder": (no_touch, f"stripes, light: {NO_TOUCH}"),
+    "excuse of a lost encoder": (no_touch, f"stripes, light: touch cannot be left out because {NO_TOUCH}"),
+    "no reason": (no_vision, "stripes, pattern: both cannot be left out because x"),
+    "no reason for a task": (lambda value: not_run(value["blocks"][1]), "touch cannot be left out because no time"),
+    "untrue of a set": (lambda value: not_run(value["blocks"][1], "the encoder takes"), "light: touch cannot be left"),
+    "simulated": (simulated, "elsewhere, pattern: vision cannot be left out because .*elsewhere is not there"),
     "leak": (put("blocks", 0, "leaks", value=[-1]), "a leak mark, a note, a group or what"),
     "group by": (lambda value: value["blocks"][0].pop("group_by"), "a leak mark, a note, a group or what"),
     "list for a number": (put("encoder", "images_seen", value=[]), "a.json is damaged"),

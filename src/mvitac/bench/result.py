@@ -43,6 +43,7 @@ ENCODER = ("name", "seeds", "weights", *ENCODER)
 EXTERNAL = ("encoder", "title", "seed", "weights", "notes", "encoders")
 BLOCK = ("set", "task", "not_run", "form", "data", "group_by", "groups", "leaks", "left_out", "records", "notes")
 NO_IMAGENET = "without the control imagenet"  # a note
+MISFIT = ("the encoder takes ", "the encoder was trained on touch ")  # reasons of runs alone (``misfit``)
 GUESS = "majority or mean"  # what the page calls these two controls
 MAX_NAME = 200
 
@@ -156,17 +157,34 @@ def problems(value: dict[str, Any]) -> list[str]:
     if all("not_run" in block for block in value["blocks"]):
         found.append("was run on no task")
     data: dict[str, Any] = {}
-    scored = {r["modality"] for b in value["blocks"] for r in b.get("records", ()) if not r["source"]}
-    reads = {*encoder["parameters"], *(scored & {*MODALITIES}), *(MODALITIES if "both" in scored else ())}
-    untrue = {f"the encoder has no {modality}" for modality in reads}  # no reason for a score that is not there
+    scored: dict[str, set[str]] = {one.name: set() for one in suite.sets}
+    for block, record in ((b, r) for b in value["blocks"] for r in b.get("records", ()) if not r["source"]):
+        scored[block["set"]] |= _senses(record["modality"])
+    reads = {*encoder["parameters"], *encoder.get("features", ())}.union(*scored.values())
+    here = {one.name for one in suite.sets for form in one.forms if not form.at}  # data that can be had anywhere
+    here |= {block["set"] for block in value["blocks"] if "data" in block}
     for block, (one, ask) in zip(value["blocks"], asked, strict=True):
         if "data" in block and data.setdefault(one.name, block["data"]) != block["data"]:
             found.append(f"{one.name}, {ask.name}: its data is not that of the set's other tasks")
-        given = {block.get("not_run", ""), *block.get("left_out", {}).values()}
-        found += [f"{one.name}, {ask.name}: {text}" for text in given & untrue]
+        given = [((m,), why) for m, why in block.get("left_out", {}).items()]
+        if "not_run" in block and (one.name in here or block["not_run"].startswith("the encoder ")):
+            given.append((ask.modalities, block["not_run"]))
+        untrue = [each for each in given if _untrue(*each, encoder, reads, scored[one.name])]
+        found += [f"{one.name}, {ask.name}: {' and '.join(m)} cannot be left out because {why}" for m, why in untrue]
         if "not_run" not in block:
             found += [f"{one.name}, {ask.name}: {text}" for text in _of_block(block, suite, one, ask, encoder)]
     return found
+
+
+def _senses(modality: str) -> set[str]:
+    return {*MODALITIES} if modality == "both" else {modality}
+
+
+def _untrue(modalities: Sequence[str], why: str, encoder: dict[str, Any], reads: set[str], scored: set[str]) -> bool:
+    """Whether ``why`` is no reason for scores that are not there: ``reads`` the encoder somewhere, ``scored`` in the set."""
+    senses, run = [_senses(m) for m in modalities], "external" not in encoder
+    known = why in {f"the encoder has no {m}" for m in set().union(*senses) - reads} or (run and why.startswith(MISFIT))
+    return not known or any(each <= (scored if run else reads) for each in senses)
 
 
 def unknown_fields(value: dict[str, Any], parts: Sequence[tuple[dict[str, Any], Sequence[str]]]) -> Iterator[str]:
