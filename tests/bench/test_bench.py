@@ -292,6 +292,13 @@ def no_mean(value: dict[str, Any]) -> None:
     sums |= {name: [[0.0 for _ in each] for each in sums[name]] for name in ("error", "squared_error")}
 
 
+def other_unit(value: dict[str, Any]) -> None:
+    """Values a thousand times as large, alike in each group, errors as they were: all R2 are 100 %."""
+    for sums in (record["sums"] for record in value["blocks"][1]["records"]):
+        sums["value"] = [[1e3 * x for x in each] for each in sums["value"]]
+        sums["squared_value"] = (np.square(sums["value"]) / np.maximum(sums["n"], 1)).tolist()
+
+
 def own_control(value: dict[str, Any]) -> None:
     """The suite asks for a column of the data."""
     value["suite"]["sets"][0]["forms"][0]["data"] = {"name": "folder", "controls": ["width = w,h"]}
@@ -348,6 +355,7 @@ FORGED: dict[str, tuple[Change, str]] = {
     "a truth for a count": (put(*RECORDS, 0, "sums", "correct", 0, value=True), "its sums are no numbers"),
     "all guesses right": (all_right, "one answer is right for all rows"),
     "no error of a mean": (no_mean, "its errors are smaller than those of any one answer"),
+    "errors in another unit": (other_unit, "its errors are smaller than those of any one answer"),
     "control of the data": (own_control, "lacks width, none, linear, None"),
     "note": (put("blocks", 0, "notes", value=[5]), "a leak mark, a note, a group or what groups are is no text"),
     "clipped": (put(*VALUES, "clipped", value=[9, 4]), "9 of its 4 features were clipped"),

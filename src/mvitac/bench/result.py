@@ -166,7 +166,7 @@ def problems(value: dict[str, Any]) -> list[str]:
     for block, (one, ask) in zip(value["blocks"], asked, strict=True):
         if "data" in block and data.setdefault(one.name, block["data"]) != block["data"]:
             found.append(f"{one.name}, {ask.name}: its data is not that of the set's other tasks")
-        given = [((m,), why) for m, why in block.get("left_out", {}).items()]
+        given: list[tuple[Sequence[str], str]] = [((m,), why) for m, why in block.get("left_out", {}).items()]
         if "not_run" in block and (one.name in here or block["not_run"].startswith("the encoder ")):
             given.append((ask.modalities, block["not_run"]))
         untrue = [each for each in given if _untrue(*each, encoder, reads, scored[one.name])]
@@ -248,7 +248,7 @@ def _of_block(
         what = f"{record['modality']}, {record['source'] or 'the encoder'}, {record['probe']}, seed {record['seed']}"
         if have[record["source"], record["modality"], record["probe"], record["seed"]] > 1:
             yield f"{what}: is there twice"
-        if why := _impossible(record, len(block["groups"])):
+        if why := _impossible(record, len(block["groups"]), one.folds):
             yield f"{what}: {why}"
         scored = [record.get("targets"), *(record["sums"][name] for name in ABOUT_ROWS if name in record["sums"])]
         if rows.setdefault(record["modality"], scored) != scored:
@@ -273,7 +273,7 @@ def _expected(suite: Suite, ask: SuiteTask, block: dict[str, Any], seeds: Sequen
     return found | {("mean" if values else "majority", "none", "linear", None)}
 
 
-def _impossible(record: dict[str, Any], num_groups: int) -> str:
+def _impossible(record: dict[str, Any], num_groups: int, folds: int) -> str:
     """Why no predictions give the sums of a record; "" if some do."""
     names = SUMS if "targets" in record else COUNTS
     if {*record["sums"]} != {*names} or {*record} - {*KEY, "clipped", "targets", "sums"}:
@@ -304,6 +304,9 @@ def _impossible(record: dict[str, Any], num_groups: int) -> str:
         if record["source"] == "majority" and (sums["correct"] >= n).all():
             return "one answer is right for all rows"
         return "it has more correct rows than rows" if (sums["correct"] > n).any() else ""
+    if record["source"] == "mean" and not folds:  # one answer for all rows: their sums are as those of one group
+        sums = {name: np.c_[each, each.sum(1)] for name, each in sums.items()}
+        n = sums["n"]
     least = 1 - 1e-6  # sums have ten digits
     error, squared = sums["error"], sums["squared_error"]
     low, high = error**2 / np.maximum(n, 1), error**2
