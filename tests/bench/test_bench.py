@@ -580,6 +580,7 @@ def test_shipped_suites_keep_their_definitions() -> None:
     ("text", "expected"),
     [
         ("name = ", "is not a suite"),
+        (SUITE.replace(FORM, f'{FORM}\npins = {{ rows = "0" }}', 1), "form 'pack' has pins, .* leave them out"),
         (SUITE.replace('"folded"', '"stripes"'), "of stripes, stripes, elsewhere one is there twice"),
         (
             SUITE.replace("labels = [0.3]", "labels = [0.3, 0.3]"),

@@ -130,6 +130,8 @@ def find_suite(name: str) -> Suite:
         suite = from_json(Suite, tomllib.loads(file.read_text()), "suite")
         for form in (form for one in suite.sets for form in one.forms):
             _check_places(form, _config(form, Path(), form.data))
+            if form.pins and suite.name not in shipped():
+                raise ValueError(f"form {form.name!r} has pins, which only shipped suites keep: leave them out")
         for text, weights in {**dict.fromkeys(suite.untrained, "random"), suite.imagenet: "pretrained"}.items():
             if (getattr(adapter := parse(text), "weights", ""), adapter.reads) != (weights, "both"):
                 raise ValueError(f"control {text!r}: give external:timm/NAME,weights={weights}, which reads both")
