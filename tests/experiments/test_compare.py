@@ -189,6 +189,13 @@ def test_damaged_plans_are_one_line(tmp_path: Path, text: str, says: str) -> Non
         find_plan(str(tmp_path / "p.toml"))
 
 
+def test_an_unknown_method_is_told_of_its_own_row(pack: Pack) -> None:
+    plan = small(pack, rows=(Row(label="MViTac"), Row(label="x", method="nope")))
+    assert plan.data and plan.run(plan.rows[0], plan.data, 0).method.name == "mvitac"
+    with pytest.raises(ValueError, match="row 'x': unknown method 'nope'"):
+        plan.run(plan.rows[1], plan.data, 0)
+
+
 def test_some_rows_of_a_plan_stand_beside_its_reference() -> None:
     assert [row.label for row in TABLE1.only(["SSVTP", "TAG (CMC)"]).rows] == ["TAG (CMC)", "SSVTP", "MViTac"]
     assert TABLE1.only([]) == TABLE1

@@ -111,7 +111,8 @@ class Plan:
         """The run of a row and seed, ``phased`` as for ``recipe``; ValueError if a field or its value does not fit."""
         try:
             base = with_method(recipe(row.recipe or self.recipe, data, phased), row.method)
-            known = {f"method.{name}" for each in self.rows for name in vars(default(MethodConfig, each.method))}
+            methods = {each.method for each in self.rows} & {*MethodConfig.choices}  # another row may name none of them
+            known = {f"method.{name}" for method in methods for name in vars(default(MethodConfig, method))}
             lacked = known - {f"method.{name}" for name in vars(base.method)}  # --set means those that have the field
             shared = {name: value for name, value in dotted(self.set) if ".".join(name.split(".")[:2]) not in lacked}
             return replace(changed(base, {**shared, **row.set}), seed=seed)
