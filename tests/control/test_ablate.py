@@ -221,6 +221,7 @@ def test_command(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     for code, says in (
         ("return [0.0]", "gives 1 numbers"),
         ("return [np.nan, 0]", "gives [nan 0.] in step 0 of episode 1"),
+        ("return [0, -1e308]", "in step 0 of episode 1: give finite numbers below 1e+60"),
         ("seen.append(0)\n    return [1e-4 * len(seen), o['step']]", "acts differently on the same episodes"),
         ("sys.exit(0)", "fails (SystemExit: 0)"),
         (

@@ -43,6 +43,7 @@ PLAUSIBLE = ("another episode", f"{LAG} frames ago")  # what a policy may have m
 KINDS = ("mean frame", *PLAUSIBLE, "noise")
 SMALL = 0.02  # standard deviations of the action; below this a policy does not react
 SAME = 1e-3  # standard deviations by which answers to the same images may differ, as a GPU's do
+MOST = 1e60  # below which lie actions: their squares, in any unit, are finite
 FRAMES = 200  # that the mean frame and the strength of noise are of
 
 
@@ -227,8 +228,8 @@ def _action(policy: Policy, given: dict[str, Any], number: int) -> np.ndarray:
     place = f"in step {given['step']} of episode {number + 1}"
     own = copy.deepcopy(given)  # which it may change in place
     action = _given(lambda: np.asarray(policy(own), float).ravel(), place)
-    if not np.isfinite(action).all():
-        raise ValueError(f"the policy gives {action} {place}")
+    if not (np.abs(action) < MOST).all():
+        raise ValueError(f"the policy gives {action} {place}: give finite numbers below {MOST:g}")
     return action
 
 
