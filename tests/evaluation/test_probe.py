@@ -300,6 +300,11 @@ def test_classes_that_train_lacks_are_named_below_the_scores(runs: list[Path], p
     found = probe_runs(runs[:1], asked, with_columns(pack, label_pattern=labels))
     num, name = (labels[test] == 2).sum(), pack.spec.tasks[0].classes[2]
     assert found["notes"] == [f"pattern: {num} of {len(test)} test rows have classes that train lacks: {name}"]
+    labels[:] = labels % 2
+    labels[np.isin(pack.column("group"), pack.column("group")[test[0]])] = 2  # in one fold's test alone
+    found = probe_runs(runs[:1], replace(asked, folds=2), with_columns(pack, label_pattern=labels))
+    num, of = (labels == 2).sum(), {record["num_test"] for record in found["records"]}
+    assert found["notes"][1:] == [f"pattern: {num} of {of.pop()} test rows have classes that train lacks: {name}"]
 
 
 def test_seeds_whose_automatic_precision_differs_are_seeds_of_one_run(pack: Pack, tmp_path: Path) -> None:

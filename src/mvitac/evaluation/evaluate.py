@@ -1,7 +1,7 @@
 """Evaluate finished runs: probe them and their controls together, in one result for tables and reports."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -99,10 +99,11 @@ def probe_runs(
     sources = check_unseen(paths, pack, tasks, weights, allow_leak=allow_leak or bool(session.folds))
     score = partial(_score, [*zip(paths, models, names, sources, strict=True)], runs, modalities, session)
     if session.folds:
-        records, retrieval = _in_folds(score, pack, others, tasks, session.folds, sources), []
+        records, unlearned = _in_folds(score, pack, others, tasks, session.folds, sources)
         tested = [f"{session.folds} folds: every {pack.spec.group_by} that no run learned from is tested once"]
+        tested, retrieval = tested + unlearned, []
     else:
-        (records, retrieval), tested = score(pack, others, tasks), _unlearned(pack, tasks)
+        (records, retrieval), tested = score(pack, others, tasks), _unlearned([(t, [pack]) for t in tasks])
     leaks = [*leaks_of(every := [*records, *retrieval]), *([] if session.folds else mark_split_leaks(pack, every))]
     classes = {task.name: list(task.classes) for task in tasks if isinstance(task, Task)}
     result = {
@@ -175,18 +176,17 @@ def _in_folds(
     tasks: Sequence[AnyTask],
     num: int,
     sources: Sequence[list[Source] | None],
-) -> Records:
-    """Probe records of all folds, pooled. There is no retrieval: a fold has too few groups to search in."""
+) -> tuple[Records, list[str]]:
+    """Probe records of all folds, pooled, and ``_unlearned``. There is no retrieval: too few groups to search in."""
     learned = [source for several in sources for source in several or ()]
-    splits = [(task, fold_splits(pack, task, num, learned)) for task in tasks]
+    splits = [(task, [{task.split: s.tolist()} for s in fold_splits(pack, task, num, learned)]) for task in tasks]
     folds: list[Records] = []
     for k in range(num):
         folds.append([])
-        for task, split in splits:
-            cells = {task.split: split[k].tolist()}
-            own = [(model, data.with_splits(cells)) for model, data in others]
-            folds[k] += score(pack.with_splits(cells), own, [task])[0]
-    return pool(folds)
+        for task, cells in splits:
+            own = [(model, data.with_splits(cells[k])) for model, data in others]
+            folds[k] += score(pack.with_splits(cells[k]), own, [task])[0]
+    return pool(folds), _unlearned([(task, map(pack.with_splits, cells)) for task, cells in splits])
 
 
 def as_trained(model: Model, pack: Pack) -> Pack:
@@ -213,15 +213,15 @@ def noted(pack: Pack, paths: Sequence[Path]) -> Pack:
     return pack
 
 
-def _unlearned(pack: Pack, tasks: Sequence[AnyTask]) -> list[str]:
-    """A line for each task with test rows of classes that no probe learns, so that all answers for them are wrong."""
+def _unlearned(views: Iterable[tuple[AnyTask, Iterable[Pack]]]) -> list[str]:
+    """A line for each task with test rows, of any fold, of classes that no probe learns: all answers for them are wrong."""
     lines = []
-    for task in (task for task in tasks if isinstance(task, Task)):
-        rows, labels = split_rows(pack, task), pack.labels(task.name)
-        new = np.setdiff1d(tested := labels[rows.test], labels[rows.fitted])
-        named, num = ", ".join(task.classes[label] for label in new), np.isin(tested, new).sum()
+    for task, folds in ((task, folds) for task, folds in views if isinstance(task, Task)):
+        each = [(split_rows(fold, task), fold.labels(task.name)) for fold in folds]
+        new = np.concatenate([y[rows.test][~np.isin(y[rows.test], y[rows.fitted])] for rows, y in each])
+        named, tested = ", ".join(task.classes[label] for label in np.unique(new)), sum(len(r.test) for r, _ in each)
         if named:
-            lines.append(f"{task.name}: {num} of {len(tested)} test rows have classes that train lacks: {named}")
+            lines.append(f"{task.name}: {len(new)} of {tested} test rows have classes that train lacks: {named}")
     return lines
 
 
@@ -269,7 +269,7 @@ def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:
             asked: ProbeConfig = from_json(ProbeConfig, result["asked"], "asked")
             scored = {Path(r["run"]).resolve() for r in result["records"] if "run" in r}
             # Of one pack, the notes tell scores on val from those on test.
-            notes = [*pack.spec.notes, *_unlearned(pack, pack.spec.all_tasks)]
+            notes = [*pack.spec.notes, *_unlearned((task, [pack]) for task in pack.spec.all_tasks)]
             same = (result["pack"], result["notes"]) == (pack.digest, notes)
             same &= result["models"] == _digests(paths)
     except ValueError as error:
