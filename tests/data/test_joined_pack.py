@@ -68,7 +68,7 @@ def test_columns_matter_that_probes_read(tmp_path: Path, column: str) -> None:
     else:
         joined = JoinedPack(*packs)
         assert (joined.labels("pattern")[packs[0].num :] == -1).all() and (joined.labels("pattern") >= 0).any()
-        with pytest.raises(ValueError, match=r"task 'pattern' has other rows, splits or units in"):
+        with pytest.raises(ValueError, match=r"task 'pattern' has rows phase=during in .*, all in"):
             JoinedPack(packs[0], toy_pack(tmp_path / "c"))
 
 

@@ -171,7 +171,7 @@ def test_packs_with_other_units_cannot_be_joined(measured: Pack) -> None:
     other = Pack(measured.path)
     task = replace(other.spec.values[0], targets=(Target(name="level", unit="%"),))
     other.spec = replace(other.spec, values=(task,))
-    with pytest.raises(ValueError, match=r"task .light. has other rows, splits or units in"):
+    with pytest.raises(ValueError, match=r"'light' has values level:levels in \S+, level:% in \S+: pack both alike"):
         JoinedPack(measured, other)
 
 

@@ -292,11 +292,19 @@ def _common_tasks(learn: Pack, score: Pack) -> dict[str, AnyTask]:
         names = [", ".join(task.name for task in pack.spec.all_tasks) or "none" for pack in (learn, score)]
         raise ValueError(f"no task is in both packs: {learn.path} has {names[0]}, {score.path} {names[1]}")
     for ours, theirs in tasks:
-        if isinstance(ours, Task) and isinstance(theirs, Task):
-            theirs = replace(theirs, classes=ours.classes)  # those are compared row by row
-        if _meaning(ours) != _meaning(theirs):
-            raise ValueError(f"task {ours.name!r} has other rows, splits or units in {score.path}")
+        other = _about(theirs)
+        for what, mine in _about(ours).items():
+            if mine != other[what]:
+                where = f"{mine} in {learn.path}, {other[what]} in {score.path}"
+                raise ValueError(f"task {ours.name!r} has {what} {where}: pack both alike, or one without it")
     return {ours.name: ours for ours, _ in tasks}
+
+
+def _about(task: AnyTask) -> dict[str, str]:
+    """What two tasks must share to be joined; their classes are compared row by row."""
+    units = "" if isinstance(task, Task) else ", ".join(f"{target.name}:{target.unit}" for target in task.targets)
+    only = ", ".join(f"{column}={value}" for column, value in sorted(task.only.items()))
+    return {"values": units or "none", "rows": only or "all", "split": task.split}
 
 
 def _side(pack: Pack, tasks: Tasks, part: str, keep: set[str]) -> pa.Table:
