@@ -355,11 +355,29 @@ def test_a_place_nothing_can_be_written_to(
     refused(command.replace("{out}", out), says)
 
 
+def test_contact_in_a_pack(refused: Callable[..., str], pack: Pack, tmp_path: Path) -> None:
+    for option in ("--contact 3", "--calibration 9", "--background x.png"):
+        (tmp_path / "x.png").write_bytes(b"")
+        refused(
+            f"predict e {pack.path} {option} --out {{out}}", "--background, --calibration and --contact are for rec"
+        )
+
+
+def test_an_option_given_twice(refused: Callable[..., str], finished: Path) -> None:
+    for option, other in (("--tasks", "--tasks"), ("--allow-leak", "--allow_leak"), ("--folds", "--folds=3")):
+        refused(f"probe {finished} {option} 2 {other} 3", f"{option} is given twice: give it once, with all its values")
+
+
 def test_an_output_that_is_an_input(refused: Callable[..., str], finished: Path) -> None:
     for name in ("model.safetensors", "run.json"):
         refused(f"probe {finished} --json {finished / name}", "would overwrite what the command reads")
     refused(f"bench board {finished}/run.json --out {finished}/run.json", "would overwrite what the command reads")
     (finished / "policy.py").touch()
+    (finished / "frames").mkdir(exist_ok=True)
+    (frame := finished / "frames" / "3.png").write_bytes(b"0")
+    for source in ("frames", "frames@30", "frames@30#0:0:9:9", "."):
+        refused(f"predict e {finished}/{source} --out {frame}", "would overwrite what the command reads")
+    refused(f"find x.png --model {finished} --known k --sheet {finished}/pack.json", "give the name of a .png file")
     refused(f"ablate {finished}/policy.py:act --data a --json {finished}/policy.py", "would overwrite what the command")
 
 

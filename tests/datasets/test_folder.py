@@ -308,6 +308,8 @@ def test_sixteen_bits_are_scaled_not_clipped(tmp_path: Path) -> None:
         assert (image[..., 0].ravel() == np.arange(256)).all()
         with pytest.raises(ValueError, match="the model does not know how they were scaled"):
             decode(tmp_path / name)
+    Image.fromarray(values / np.float32(65535)).save(tmp_path / "float.tif")
+    assert (np.asarray(decode(tmp_path / "float.tif", span=()))[..., 0].ravel() == np.arange(256)).all()
     Image.fromarray(np.zeros((9, 9, 3), np.uint8)).save(tmp_path / "rgb.png")
     with pytest.raises(ValueError, match="read as RGB of 8 bits"):
         decode(tmp_path / "rgb.png", span=(0, 2040))
@@ -379,7 +381,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "truncated": (damage_truncated, "Premature end of JPEG file"),
     "broken png": (damage_png, "cannot"),
     "animation": (lambda path: BLACK.save(path, "GIF", save_all=True, append_images=[WHITE]), "2 frames"),
-    "float": (lambda path: Image.fromarray(np.ones((8, 8), np.float32)).save(path, "TIFF"), "floating-point"),
+    "float": (lambda path: Image.fromarray(np.full((8, 8), 1.5, np.float32)).save(path, "TIFF"), "not 0 to 1"),
     "32 bit": (lambda path: Image.fromarray(np.full((8, 8), 70000, np.int32)).save(path, "TIFF"), "not 0 to 65535"),
     "gone": (lambda path: path.unlink(), "No such file"),
 }

@@ -12,6 +12,8 @@ import mvitac
 from mvitac.data.pack import Pack
 from mvitac.deploy.artifact import ARTIFACT, preprocessing
 from mvitac.deploy.card import card
+from mvitac.deploy.export import export
+from mvitac.deploy.export_config import ExportConfig
 from mvitac.deploy.publish import fit_probes, publish, with_probes
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import fitting
@@ -64,8 +66,13 @@ def test_the_part_of_images_is_that_of_the_data_of_the_probes(smoke_run: Path, p
     assert with_probes(load(smoke_run), with_columns(pack, spec=replace(pack.spec, crop=part))).spec.crop == part
 
 
+def test_an_artifact_has_one_set_of_weights(artifact: Path) -> None:
+    with pytest.raises(ValueError, match="has one set of weights: leave out 'best'"):
+        mvitac.load(artifact, which="best")
+
+
 def test_difference_images_are_told(smoke_run: Path, pack: Pack, tmp_path: Path) -> None:
-    """By model and card; raw packs are not taken for them."""
+    """By model and card; raw packs are not taken for them, nor they for raw ones."""
     model = mvitac.load(smoke_run)
     assert preprocessing(model)["background"].startswith("none is subtracted") and fitting(model, pack)
     model.spec = replace(model.spec, difference=True)
@@ -81,6 +88,8 @@ def test_difference_images_are_told(smoke_run: Path, pack: Pack, tmp_path: Path)
     for pair in ((mvitac.load(smoke_run), minus), (found, pack)):
         with pytest.raises(ValueError, match="difference images"):
             fit_probes(*pair)
+    with pytest.raises(ValueError, match="trained without difference images"):
+        export(mvitac.load(smoke_run), minus, tmp_path / "e", ExportConfig())
 
 
 def test_the_hub_offline_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -94,9 +94,15 @@ def test_the_resize_in_the_graph_is_the_probes_pixel_by_pixel(stored: int, model
     torch.testing.assert_close(found, plain_view(images, 32), atol=1e-4, rtol=0)
 
 
+@pytest.mark.parametrize("wrong", [{"num_rows": 1}, {"num_rows": -3}, {"value_loss": float("inf")}])
+def test_a_check_that_checks_nothing_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="give 2 rows or more, and losses from 0"):
+        ExportConfig(**wrong)
+
+
 def test_an_unknown_runtime_is_refused(onnx: Path) -> None:
     wrong: Any = {"engine": "torchscript"}
-    for given in (wrong, {"threads": -1}):
+    for given in (wrong, {"threads": -1}, {"threads": "2"}, {"threads": 1.5}):
         with pytest.raises(ValueError, match="give one of auto, onnxruntime, openvino, and 0 or more"):
             Engine(onnx, **given)
 

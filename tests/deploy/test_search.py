@@ -84,8 +84,10 @@ def test_a_changed_file_or_another_models_is_refused(known: Path, tmp_path: Path
     data = bytearray(known.read_bytes())
     data[len(data) // 2] ^= 1
     (tmp_path / "changed").write_bytes(data)
-    with pytest.raises(OSError, match="CRC"):
-        Embeddings(tmp_path / "changed", model.weights_digest())
+    (tmp_path / "text").write_text("id,group")
+    for name, why in (("changed", "CRC"), ("text", "Parquet")):
+        with pytest.raises(ValueError, match=f"{name} is no table of mvitac embed: .*{why}"):
+            Embeddings(tmp_path / name, model.weights_digest())
     with pytest.raises(ValueError, match="embedded by another model"):
         Embeddings(known, "0" * 64)
 

@@ -171,6 +171,8 @@ def predict(argv: list[str]) -> None:
     opened = {m: [recording(text) for text in texts] for m, texts in given.items() if texts and files}
     single = [recording(options.source)] if options.source and files else []
     config: Any = None if files else dataset(options.source or "")  # what cannot be read is refused before an export
+    if config and (options.background or options.live != LiveConfig()):
+        raise ValueError("--background, --calibration and --contact are for recordings: leave them out")
     engine = _engine(options.model, options.threads, tuple(opened), most=1 if single else 2)
     if not (engine.classes or engine.values):
         raise ValueError(f"{options.model} has no probes of classes or values: export it on data that has labels")

@@ -41,7 +41,7 @@ COMMANDS = {
 """Command -> module of this package:function, imported when called."""
 
 OWN = (
-    *(".safetensors", ".npy", ".onnx", ".pt", "samples.parquet"),
+    *(".safetensors", ".npy", ".onnx", ".pt", "samples.parquet", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"),
     *("run.json", "pack.json", "export.json", "artifact.json"),
 )
 HEAVY = ("demo", "pretrain", "finetune", "compare", "bench")
@@ -101,6 +101,7 @@ def _run(arguments: list[str]) -> int:
         print(text.read_text(encoding="utf-8"), end="")
         return 0
     if not {"-h", "--help"} & set(rest):
+        _check_once(rest)
         _check_choices(rest, text)
         _check_outputs(rest)
         if name in HEAVY:
@@ -109,6 +110,13 @@ def _run(arguments: list[str]) -> int:
             loading()
     module, function = COMMANDS[name].split(":")
     return getattr(importlib.import_module(f"mvitac.cli.{module}"), function)(rest) or 0
+
+
+def _check_once(words: Sequence[str]) -> None:
+    """ValueError for an option that is given twice: only the last one would count."""
+    names = [word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"{twice[0]} is given twice: give it once, with all its values")
 
 
 def _check_choices(rest: Sequence[str], text: Path) -> None:
@@ -124,15 +132,18 @@ def _check_choices(rest: Sequence[str], text: Path) -> None:
 
 
 def _check_outputs(words: Sequence[str]) -> None:
-    """ValueError for an output that is an input, or one of the files ``OWN`` of a run, pack or export that is one."""
+    """ValueError for an output that is an input, or a file with a name of ``OWN`` in a folder that is one."""
     places = [part for word in words for part in word.split("=")]
     for at, (option, out) in enumerate(itertools.pairwise(places)):
         if option in ("--out", "--json", "--sheet") and os.path.isfile(out):
             others = (*places[: at + 1], *places[at + 2 :])
-            parts = [part for each in others for part in (re.sub(r"#.*|@[\d.]+$", "", each), *re.split("[,:]", each))]
+            parts = [
+                part for each in others for part in (re.sub(r"(@[\d.]+)?(#.*)?$", "", each), *re.split("[,:]", each))
+            ]
             inputs = [place for place in parts if os.path.exists(place)]
-            own = [os.path.join(place, os.path.basename(out)) for place in inputs if out.endswith(OWN)]
-            if any(os.path.exists(place) and os.path.samefile(out, place) for place in (*inputs, *own)):
+            own = {os.path.realpath(place) for place in inputs if out.lower().endswith(OWN)}
+            inside = own & {os.fspath(folder) for folder in Path(out).resolve().parents}
+            if inside or any(os.path.samefile(out, place) for place in inputs):
                 raise ValueError(f"{option} {out} would overwrite what the command reads: choose another file")
 
 

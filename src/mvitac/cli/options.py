@@ -125,6 +125,8 @@ def check_json(path: Path | None, option: str = "--json") -> None:
         check_place(path)
         if path.is_dir():
             raise ValueError(f"{option} {path} is a folder: give another place, the name of a file")
+        if option == "--sheet" and path.suffix.lower() != ".png":
+            raise ValueError(f"--sheet {path}: give the name of a .png file")
 
 
 def printed_to(json_file: Path | None) -> TextIO:

@@ -108,9 +108,8 @@ def to_rgb(image: Image.Image, span: Sequence[float] | None = None) -> Image.Ima
     if image.mode.startswith("I") or image.mode == "F":  # PIL's own conversion clips instead
         if span is None:
             raise ValueError("it has more than 8 bits, and the model does not know how they were scaled: pack it, too")
-        if image.mode == "F" and not span:
-            raise ValueError("it holds floating-point values of unknown range: --data.range COLUMN=LOW:HIGH")
-        return Image.fromarray(to_gray(np.asarray(image), span or (0, 65535), bool(span))).convert("RGB")
+        levels = span or ((0, 1) if image.mode == "F" else (0, 65535))
+        return Image.fromarray(to_gray(np.asarray(image), levels, bool(span))).convert("RGB")
     if span:
         raise ValueError(f"it is read as {image.mode} of 8 bits: --data.range is for gray images of more")
     if image.mode in ("LA", "La", "PA", "RGBA", "RGBa") or "transparency" in image.info:

@@ -59,8 +59,12 @@ def load(path: str | Path, which: models.Which = "last") -> Model:
     found = HUB_ID.fullmatch(path) if isinstance(path, str) else None
     # "runs/frist" beside a folder runs/ is a typing mistake, not a repository.
     if found and not local.exists() and not local.parent.is_dir():
-        return read(pull(found["repo"], found["revision"]))
-    return read(local) if (local / ARTIFACT.name).is_file() else models.load(local, which)
+        local = pull(found["repo"], found["revision"])
+    elif not (local / ARTIFACT.name).is_file():
+        return models.load(local, which)
+    if which != "last":
+        raise ValueError(f"{path} is an artifact, which has one set of weights: leave out {which!r}")
+    return read(local)
 
 
 def pull(repo: str, revision: str | None) -> Path:

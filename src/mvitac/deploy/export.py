@@ -49,7 +49,7 @@ def export(
     """
     if config.precision == "bf16" and not has_bf16(torch.device("cpu")):
         raise ValueError("--precision bf16: this CPU does not compute bf16 itself, so it could not be checked")
-    asked = tuple(sorted(config.modalities, reverse=True)) or tuple(model.encoders)  # vision, touch
+    asked = tuple(sorted({*config.modalities}, reverse=True)) or tuple(model.encoders)  # vision, touch
     known, pack = pack, new or pack
     if new and "touch" not in asked:
         raise ValueError(f"{NEW_SENSOR} is about touch, which this export lacks: leave it out")
@@ -57,6 +57,8 @@ def export(
         if {*fitting(model, given, asked)} != {*asked} or given.size != model.stored:
             what = f"{' and '.join(asked)} at {model.stored} px"
             raise ValueError(f"{given.path} cannot check this model: it needs images of {what}")
+        if "touch" in asked and given.spec.difference and not model.spec.difference:
+            raise ValueError(f"{given.path} cannot check this model: it was trained without difference images")
     graph = ExportModule(model, asked, learn_looks(known, new, NEW_SENSOR) if new else None)
     rows = pack.rows("test", having=asked)
     if new and not len(rows):

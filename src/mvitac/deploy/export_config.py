@@ -26,7 +26,12 @@ class ExportConfig:
     value_loss: float = 0.1
     """Change of any predicted value on the test rows (root mean square), in standard deviations of that value."""
     num_rows: Annotated[int, arg(name="rows")] = 512
-    """Maximum number of test rows to check on."""
+    """Maximum number of test rows to check on, 2 or more."""
+
+    def __post_init__(self) -> None:
+        if self.num_rows < 2 or not (0 <= self.accuracy_loss <= 100 and 0 <= self.value_loss < 1e6):
+            limits = f"accuracy_loss {self.accuracy_loss:g}, value_loss {self.value_loss:g}"
+            raise ValueError(f"rows {self.num_rows}, {limits}: give 2 rows or more, and losses from 0")
 
     @property
     def tolerance(self) -> dict[str, float]:

@@ -18,7 +18,7 @@ from mvitac.data.pack import Pack
 from mvitac.evaluation.features import features, fitting
 from mvitac.model import Model
 from mvitac.registry import check_known, from_json
-from mvitac.system.files import fields_of, write_atomic
+from mvitac.system.files import brief, fields_of, write_atomic
 from mvitac.transforms.preprocess import ImageInput
 
 ABOUT = b"mvitac-embeddings"  # entry of the file's metadata: JSON
@@ -51,7 +51,10 @@ class Embeddings:
     def __init__(self, file: Path, weights: str) -> None:
         """``weights``: digest of the model that embeds the queries. ValueError if another one embedded the rows."""
         self.file = file
-        self.table: pa.Table = pq.read_table(file, page_checksum_verification=True)
+        try:
+            self.table: pa.Table = pq.read_table(file, page_checksum_verification=True)
+        except (pa.ArrowException, OSError) as error:
+            raise ValueError(f"{file} is no table of mvitac embed: {brief(error)}") from None
         with fields_of(file):
             about = json.loads(self.table.schema.metadata[ABOUT])
             self.shared, self.pack, self.pack_digest = about["shared"], Path(about["pack"]), about["pack_digest"]

@@ -74,7 +74,7 @@ class Finetuning:
     def __post_init__(self) -> None:
         if not (self.lr and self.steps and self.fractions and 0 < self.seeds <= 1000 and self.batch_size > 1):
             raise ValueError("give at least one of lr, steps, fractions, seeds (up to 1000), and batches of 2 or more")
-        ProbeConfig(fractions=self.fractions)  # checks them
+        ProbeConfig(fractions=self.fractions, modalities=self.modalities)  # checks them
 
 
 def finetune(
