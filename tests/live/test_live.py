@@ -156,8 +156,7 @@ def test_minutes_of_faults(engine: Engine) -> None:
 @pytest.mark.parametrize("free", [7, 5])
 def test_a_touch_while_calibrating_is_named(free: int) -> None:
     """Also one of exactly half of the frames, which once passed for noise and hid every later touch."""
-    config = LiveConfig(calibration=10)
-    contact, clock = Contact(config), Clock()
+    contact, clock = Contact(LiveConfig(calibration=10)), Clock()
     rig = Rig(clock, 0)
     for t in (3.0,) * free + (4.5,) * (10 - free):
         clock.now = t
@@ -186,8 +185,7 @@ def test_a_sensor_that_starts_in_contact_is_compared_with_a_given_image(engine: 
 
 
 def test_the_background_follows_a_drifting_lamp() -> None:
-    contact = Contact(LiveConfig(calibration=5))
-    rng = np.random.default_rng(0)
+    contact, rng = Contact(LiveConfig(calibration=5)), np.random.default_rng(0)
     for i in range(2000):
         image = 100 + i * 0.02 + rng.normal(0, 1, (32, 32, 3))
         assert not contact(image.astype(np.uint8)), i
@@ -219,14 +217,12 @@ def test_sources_by_name(tmp_path: Path) -> None:
     (tmp_path / "1.png").write_bytes(b"damaged")
     folder = source(f"{tmp_path}@15", "touch")
     assert isinstance(folder, Folder) and folder.fps == 15
-    stream = Stream("touch", folder, clock=Clock())
-    seen = []
+    stream, seen = Stream("touch", folder, clock=Clock()), []
     while not stream.ended:
         stream.pump()
         frame = stream.newest()
         seen.append(frame.image[0, 0, 0] if frame else None)
-    assert seen == [0, 0, 20, 20] and stream.num_damaged == 1
-    assert isinstance(source("sim:3", "vision"), Simulated)
+    assert seen == [0, 0, 20, 20] and stream.num_damaged == 1 and isinstance(source("sim:3", "vision"), Simulated)
     for text, says in (
         ("nothing", "'nothing': give a video"),
         ("sim:-3", "'-3' is no seed"),
@@ -357,8 +353,7 @@ def test_a_recording_is_a_pack(engine: Engine, tmp_path: Path) -> None:
     world = World(engine, record=record)
     world.run(40)
     assert recorder.close() == pytest.approx(200, abs=4)
-    pack = Pack(tmp_path / "pack")
-    times = dict(kept)
+    pack, times = Pack(tmp_path / "pack"), dict(kept)
     for row in (0, 77, pack.num - 1):
         assert np.array_equal(pack.images["touch"][row], times[pack.column("time")[row]])
     assert set(pack.column("split")) == {"unlabelled"}
@@ -388,8 +383,7 @@ def test_a_full_disk_ends_the_recording_only(tmp_path: Path, monkeypatch: pytest
 
 def test_a_recording_survives_a_crash(tmp_path: Path) -> None:
     out = tmp_path / "recording"
-    recorder = Recorder(out, fps=1.0)
-    image = np.zeros((16, 16, 3), np.uint8)
+    recorder, image = Recorder(out, fps=1.0), np.zeros((16, 16, 3), np.uint8)
     for i in range(130):
         recorder({"touch": image + i}, {"time": float(i), "contact": i % 2 == 0, "touch_number": i // 2})
     del recorder  # killed: two of three parts are on disk

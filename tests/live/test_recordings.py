@@ -68,8 +68,7 @@ def test_every_frame_is_answered_as_the_engine_answers_it(engine: Engine, films:
     for number in (0, 7, 33, NUM - 1):
         nearest = min(images["vision"], key=lambda i: abs(i / 12 - number / 25))
         pair = {"vision": images["vision"][nearest], "touch": images["touch"][number]}
-        outputs = engine(**{m: fit(image, 32)[None] for m, image in pair.items()})
-        p = outputs["probability_pattern"][0]
+        p = engine(**{m: fit(image, 32)[None] for m, image in pair.items()})["probability_pattern"][0]
         names = [f"pattern.{name}" for name in engine.classes["pattern"]]
         assert [table[name][number] for name in names] == pytest.approx(p, abs=1e-5)
         assert f"pattern.{table['pattern'][number]}" == names[p.argmax()]
@@ -79,11 +78,9 @@ def test_every_frame_is_answered_as_the_engine_answers_it(engine: Engine, films:
 def test_damaged_frames_are_left_out(engine: Engine, films: dict[str, Path], tmp_path: Path) -> None:
     """And named; 2.png comes before 10.png, as in a pack."""
     for number in range(NUM):
-        image = np.full((32, 32, 3), 100 if number < FREE else 160, np.uint8)
-        Image.fromarray(image).save(tmp_path / f"{number}.png")
+        Image.fromarray(np.full((32, 32, 3), 100 if number < FREE else 160, np.uint8)).save(tmp_path / f"{number}.png")
     (tmp_path / "3.png").write_bytes(b"damaged")
-    files = opened(films) | {"touch": [recording(f"{tmp_path}@25")]}
-    hurt = Recordings(engine, files, FIRST)
+    hurt = Recordings(engine, opened(films) | {"touch": [recording(f"{tmp_path}@25")]}, FIRST)
     table = whole(hurt.tables())
     assert table["frame"].tolist() == [i for i in range(NUM) if i != 3] and hurt.left_out == 1
     assert table["time"][3] == pytest.approx(4 / 25) and table["contact"].sum() == NUM - FREE
@@ -120,8 +117,7 @@ def test_a_model_of_difference_images_needs_the_free_sensor(
 
 def test_a_pack_is_answered_row_by_row(engine: Engine, pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
     table = whole(pack_tables(engine, pack))
-    assert table["frame"].tolist() == list(range(pack.num))
-    assert table["id"].tolist() == pack.column("id").tolist()
+    assert table["frame"].tolist() == list(range(pack.num)) and table["id"].tolist() == pack.column("id").tolist()
     outputs = engine(**{m: pack.images[m][100:110] for m in engine.inputs})
     assert table["pattern.rows"][100:110] == pytest.approx(outputs["probability_pattern"][:, 1], abs=1e-5)
     monkeypatch.setattr(engine, "difference", True)
@@ -131,8 +127,7 @@ def test_a_pack_is_answered_row_by_row(engine: Engine, pack: Pack, monkeypatch: 
 
 def test_values_have_their_unit_and_spread(value_onnx: Path, measured: Pack) -> None:
     engine = Engine(value_onnx, threads=1)
-    table = whole(pack_tables(engine, measured))
-    target = engine.values["both"][1]
+    table, target = whole(pack_tables(engine, measured)), engine.values["both"][1]
     outputs = engine(**{m: measured.images[m][:8] for m in engine.inputs})
     assert table["both.weight [N]"][:8] == pytest.approx(outputs["value_both"][:, 1], abs=1e-4)
     assert set(table["both.weight.spread [N]"].tolist()) <= set(target["spread"])
@@ -156,8 +151,7 @@ def test_predict_command(
     (tmp_path / "short_timestamps.txt").write_text("\n".join(map(str, range(12))))  # a frame a second
     assert main([*command, "--vision", str(short), *both[2:], "--out", str(out)]) == 0
     assert "p.csv, 50 frames" in capsys.readouterr().err
-    assert main([*command, str(pack.path), "--out", str(out)]) == 0
-    assert pyarrow.csv.read_csv(out).num_rows == pack.num
+    assert main([*command, str(pack.path), "--out", str(out)]) == 0 and pyarrow.csv.read_csv(out).num_rows == pack.num
     for m in ("vision", "touch"):
         Image.fromarray(pack.images[m][7]).save(tmp_path / f"{m}.png")
     (tmp_path / "pairs.csv").write_text("vision,gel\nvision.png,touch.png\n")
@@ -195,13 +189,11 @@ def test_predict_command(
 
 def test_a_crop_is_what_the_model_sees(engine: Engine, films: dict[str, Path], tmp_path: Path) -> None:
     """Of frames and of the image without contact; one that is larger than the frames is no frame."""
-    part = (slice(30, 90), slice(40, 120))
-    folder = tmp_path / "cut"
+    part, folder = (slice(30, 90), slice(40, 120)), tmp_path / "cut"
     folder.mkdir()
     for number, image in frames(films["touch"], range(NUM)):
         Image.fromarray(image[part]).save(folder / f"{number:03}.png")
-    free = [next(iter(frames(films["touch"], [0])))[1]]
-    tables = []
+    free, tables = [next(iter(frames(films["touch"], [0])))[1]], []
     for text, background in ((f"{films['touch']}#40:30:80:60", free), (f"{folder}@25", [free[0][part]])):
         files = {"vision": [recording(str(films["vision"]))], "touch": [recording(text)]}
         tables.append(whole(Recordings(engine, files, free=background).tables()))

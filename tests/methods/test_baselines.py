@@ -48,8 +48,7 @@ def dot(a: list[float], b: list[float]) -> float:
 
 
 def test_queue_holds_the_last_keys_and_wraps() -> None:
-    queue = Queue(5, 2)
-    keys = torch.randn(9, 2)
+    queue, keys = Queue(5, 2), torch.randn(9, 2)
     for start in (0, 3, 6):
         queue.push(keys[start : start + 3])
     held = {tuple(round(v, 5) for v in row) for row in queue.keys.tolist()}
@@ -84,8 +83,7 @@ def test_cmc_equals_a_direct_transcription(softmax: bool) -> None:
         at = [ROWS.tolist().index(row) for row in batch.rows.tolist()]
         drawn = torch.randint(len(ROWS), (8, 10))
         drawn[:, 0] = torch.tensor(at)
-        z = {m: unit(tower(batch.images[m][0])) for m, tower in method.towers.items()}
-        total = 0.0
+        z, total = {m: unit(tower(batch.images[m][0])) for m, tower in method.towers.items()}, 0.0
         for name, query, bank in (("vt", "vision", "touch"), ("tv", "touch", "vision")):
             memory = banks[bank].tolist()
             logits = [[dot(z[query][i], memory[j]) / 0.07 for j in row] for i, row in enumerate(drawn.tolist())]

@@ -73,8 +73,7 @@ def test_on_a_gpu_nothing_stays_behind_and_nothing_is_waited_for(name: str) -> N
 def test_forward_is_pure(name: str) -> None:
     """Twice the same value and, but for BatchNorm's running statistics, no parameter or buffer moves before after_step."""
     method = build(name)
-    batch = views(method)
-    before = copy.deepcopy(method.state_dict())
+    batch, before = views(method), copy.deepcopy(method.state_dict())
     first, second = outcome(method, batch), outcome(method, batch)
     for key, value in first.items():
         assert torch.equal(value, second[key]), key
@@ -137,8 +136,7 @@ def numbers() -> list[tuple[str, str, object]]:
     """(method, field, impossible value) of every number in every method's config, found by reflection."""
     found: list[tuple[str, str, object]] = []
     for name in NAMES:
-        config = default(MethodConfig, name)
-        for field, kind in typing.get_type_hints(type(config)).items():
+        for field, kind in typing.get_type_hints(type(default(MethodConfig, name))).items():
             if kind is int:
                 found += [(name, field, value) for value in (-1, 0, 10**30)]
             elif kind in (float, float | None):

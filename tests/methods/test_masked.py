@@ -118,8 +118,7 @@ def rectangle(at: list[int], width: int) -> tuple[int, int]:
 def test_blocks_have_their_papers_sizes_and_do_not_overlap_the_context(grid: tuple[int, int]) -> None:
     config, num, sizes = IJEPAConfig(), grid[0] * grid[1], set()
     for seed in range(12):
-        blocks = multi_block(config, torch.tensor(seed), torch.arange(20), 0, grid)
-        shapes = set()
+        blocks, shapes = multi_block(config, torch.tensor(seed), torch.arange(20), 0, grid), set()
         for row in range(20):
             targets = [blocks.targets[row, k][blocks.in_target[row, k]].tolist() for k in range(4)]
             shapes |= {rectangle(block, grid[1]) for block in targets}

@@ -61,8 +61,7 @@ def test_each_view_passes_each_encoder_once() -> None:
 
 def test_no_key_parameter_is_optimised_or_gets_a_gradient() -> None:
     method = built()
-    optimiser = build_optimiser(Optim(), method, Encoders())
-    optimised = {id(p) for group in optimiser.param_groups for p in group["params"]}
+    optimised = {id(p) for group in build_optimiser(Optim(), method, Encoders()).param_groups for p in group["params"]}
     assert optimised == {id(p) for p in method.query.parameters()}
     method(views(method))["loss"].backward()
     assert all(p.grad is None for p in method.key.parameters())
@@ -82,8 +81,7 @@ def test_every_key_parameter_and_buffer_follows() -> None:
     query = method.query.state_dict()
     for name, value in method.key.state_dict().items():
         q = query[name.replace(".module.", ".")]
-        expected = 0.9 * before[name] + 0.1 * q if value.is_floating_point() else q
-        torch.testing.assert_close(value, expected, msg=name)
+        torch.testing.assert_close(value, 0.9 * before[name] + 0.1 * q if value.is_floating_point() else q, msg=name)
 
 
 def test_heads_are_as_printed() -> None:

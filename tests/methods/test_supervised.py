@@ -98,8 +98,7 @@ def test_values_are_learned_from_the_rows_that_probes_are_fitted_on(measured: Pa
 def test_the_own_head_is_trained_and_scored_in_the_unit(measured: Pack, tmp_path: Path) -> None:
     run = smoke(measured, steps=40, batch_size=30, eval_every=0, optim=Optim(name="adamw", lr=3e-3))
     run = replace(run, method=SupervisedConfig(tasks=("both", "pattern")))
-    model = load(train(run, tmp_path / "run", quiet=True))
-    both = measured.spec.values[1]
+    model, both = load(train(run, tmp_path / "run", quiet=True)), measured.spec.values[1]
     rows = split_rows(measured, both).test
     z = {m: pack_features(model, measured, m, rows) for m in ("vision", "touch")}
     guess, true = model.answer("both", z).numpy(), measured.values(both)[rows]

@@ -186,7 +186,6 @@ def test_numbers_of_rows_are_uniform_and_a_function_of_seed_stream_and_row() -> 
 
 def test_positions_are_sines_and_cosines_of_row_and_column() -> None:
     found = sin_cos_positions(2, 3, 8)
-    row, column = torch.tensor(1.0), torch.tensor(2.0)
-    rates = torch.tensor([1.0, 0.01])
+    row, column, rates = torch.tensor(1.0), torch.tensor(2.0), torch.tensor([1.0, 0.01])
     expected = torch.cat([(row * rates).sin(), (row * rates).cos(), (column * rates).sin(), (column * rates).cos()])
     torch.testing.assert_close(found[5], expected)

@@ -123,8 +123,7 @@ WRAPPED: dict[str, Callable[[State], dict[str, Any]]] = {
 def test_usual_beginnings_of_names_are_understood_and_said(
     start: str, state: State, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    trunk = loaded(WRAPPED[start](state), tmp_path)
-    for name, value in trunk.state_dict().items():
+    for name, value in loaded(WRAPPED[start](state), tmp_path).state_dict().items():
         assert torch.equal(value, state[name]), name
     build_trunk(EncoderConfig(trunk=NAME, weights=str(tmp_path / "w.pth")), 3)  # the other sense
     said = capsys.readouterr().err

@@ -88,8 +88,7 @@ class Noise(Source):
 
     def read(self, item: int) -> list[Sample]:
         rng, group = np.random.default_rng(item), item // 2
-        split = "test" if group in self.tested else "train"
-        columns = {"id": str(item), "group": f"{group}{HOSTILE}", "split": split}
+        columns = {"id": str(item), "group": f"{group}{HOSTILE}", "split": "test" if group in self.tested else "train"}
         labels = {"label_kind": group % 2} if self.labelled else {}
         shown = [rng.integers(0, 256, (16, 16, c), np.uint8) if c else None for c in (self.vision, self.touch)]
         return [Sample(vision=shown[0], touch=shown[1], columns={**columns, **labels})]
@@ -147,8 +146,7 @@ def test_verdict_and_figures_carry_the_numbers(materials: Path, result: dict[str
     page = Page((materials / "out" / "report.html").read_text())
     drawn = {path.name for path in (materials / "out" / "figures").iterdir()}
     assert {"probe-category.png", "loss.png", "confusion-soft.png"} <= drawn
-    assert len(page.images("svg+xml")) == len(drawn)
-    assert "Every class of category, by touch + vision" in page.text
+    assert len(page.images("svg+xml")) == len(drawn) and "Every class of category, by touch + vision" in page.text
     assert verdicts(result["summary"]["category"])[0].partition(": ")[2] in page.text.replace("\xa0", " ")
     for curve in ("parts of the loss", "effective rank", "linear probe, rough", "retrieval R@5"):
         assert curve in page.text
@@ -187,16 +185,12 @@ def test_a_mistake_is_nearest_to_another_class_by_touch_alone(tmp_path: Path) ->
 
 
 def test_hostile_names_stay_text(tmp_path: Path) -> None:
-    folder = tmp_path / "<script>x&"
-    run, _ = noise(folder, Noise(touch=6))
-    html = write_report([run], tmp_path / "out", quiet=True).read_text()
-    page = Page(html)
-    assert not page.all("script")
-    assert HOSTILE in page.text  # the data's source
+    run, _ = noise(tmp_path / "<script>x&", Noise(touch=6))
+    page = Page(write_report([run], tmp_path / "out", quiet=True).read_text())
+    assert not page.all("script") and HOSTILE in page.text  # the data's source
     assert page.text.count(HOSTILE[:15]) > 16  # the class name, in figures and below pictures
     assert any(HOSTILE in (image["alt"] or "") for image in page.all("img"))
-    widths = {int(image["width"] or 0) for image in page.images("jpeg")}
-    assert widths == {16, 32}  # two gels stand side by side
+    assert {int(image["width"] or 0) for image in page.images("jpeg")} == {16, 32}  # two gels stand side by side
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -254,8 +248,7 @@ def texts_of(records: Sequence[dict[str, Any]]) -> dict[tuple[str, ...], str]:
 
 
 def test_report_and_comparison_give_one_text_for_one_score(materials: Path, result: dict[str, Any]) -> None:
-    whole = compared(result)
-    html = (materials / "out" / "report.html").read_text()
+    whole, html = compared(result), (materials / "out" / "report.html").read_text()
     page, drawn, lines = Page(html).text, "".join(drawings(html)), lines_of(whole)
     tex = latex(whole, lines)
     for cell, text in texts_of(result["records"]).items():

@@ -74,8 +74,7 @@ def test_a_probe_that_values_lack_does_not_hide_them(scored: tuple[Path, Pack, d
     by_paper, ridge, near = (summarise(result["records"], kind) for kind in ("paper", "linear", "knn"))
     assert by_paper["light"] == ridge["light"] != near["light"]
     assert by_paper["pattern"]["touch"]["mvitac"] != ridge["pattern"]["touch"]["mvitac"]
-    again = [r for r in result["records"] if r["probe"] != "knn"]
-    assert set(summarise_again(again, "paper")) == {"pattern", "bright"}
+    assert set(summarise_again([r for r in result["records"] if r["probe"] != "knn"], "paper")) == {"pattern", "bright"}
 
 
 def test_targets_have_scores_of_their_own(scored: tuple[Path, Pack, dict[str, Any]]) -> None:
@@ -102,12 +101,10 @@ def test_the_report_shows_values(scored: tuple[Path, Pack, dict[str, Any]], tmp_
 
 
 def test_one_test_group_of_values_alone(tmp_path: Path) -> None:
-    source = altered(Toy(values=True, vision_channels=0, num=48), one_tested, tasks=())
-    run, _, result = scored_run(tmp_path, source)
+    run, _, result = scored_run(tmp_path, altered(Toy(values=True, vision_channels=0, num=48), one_tested, tasks=()))
     stored = read_json(run / "probe.json", "scores")
     cell = stored["summary"]["both"]["touch"]["pixels"]
-    assert cell["low"] is None and cell["groups"] == 1 and cell["targets"][0]["low"] is None
-    assert stored == result
+    assert cell["low"] is None and cell["groups"] == 1 and cell["targets"][0]["low"] is None and stored == result
     (run / "probe.json").unlink()  # the report probes values by itself
     text = f"{100 * cell['mean']:.1f}"
     assert cell_text(stored["summary"]["both"], "pixels", "touch") == text and "inf" not in said(stored)
@@ -139,8 +136,7 @@ def test_tables_of_a_comparison_have_a_table_of_targets(scored: tuple[Path, Pack
     assert (found["task"], found["score"], found["unit"]) == ("both", "R2", "N")
     assert float(found["mae"]) == cell["mae"] and float(found["accuracy"]) == cell["mean"]
     keys = [(r["row"], r["probe"], r["modality"], r["task"], r["target"]) for r in rows]
-    assert len(keys) == len(set(keys))
-    assert {r["probe"] for r in rows if r["row"] == "pixels"} == {"linear"}
+    assert len(keys) == len(set(keys)) and {r["probe"] for r in rows if r["row"] == "pixels"} == {"linear"}
 
 
 def test_figures_cut_off_what_no_axis_can_show() -> None:

@@ -84,8 +84,7 @@ def test_forces_balance():
         assert touch.normal_n == pytest.approx(5.0, rel=0.1)
     assert during.left.normal_n == pytest.approx(during.right.normal_n, rel=0.1) and after.success == 1
     carried = after.left.shear_n[1] + after.right.shear_n[1]  # picture rows run downwards
-    assert carried == pytest.approx(some.mass * 9.81, rel=0.1)
-    assert after.rise_m == pytest.approx(0.05, abs=0.006)
+    assert carried == pytest.approx(some.mass * 9.81, rel=0.1) and after.rise_m == pytest.approx(0.05, abs=0.006)
 
 
 def test_measured_contacts_are_of_each_gel_and_change_no_picture():
@@ -108,15 +107,13 @@ def test_outcomes_are_mixed_and_the_solver_is_stable():
         bench = physics.Bench(objects.make_thing(0, index))
         for i in range(3):
             rng = np.random.default_rng([99, index, i])
-            patch = skin.draw_patch(rng)
-            results.append(list(bench.moments(grasps.draw_plan(bench.thing, patch, rng)))[-1])
+            results.append(list(bench.moments(grasps.draw_plan(bench.thing, skin.draw_patch(rng), rng)))[-1])
     assert 0.4 < np.mean([r.success for r in results]) < 0.75 and np.mean([r.unstable for r in results]) < 0.02
 
 
 def test_peaks_and_pits_differ_in_the_sign_of_their_skewness_and_nothing_else():
     """Heights over a flank: one is the other upside down, so spread is equal and skewness opposite."""
-    rng = np.random.default_rng(1)
-    points = np.stack([np.zeros(4000), *rng.uniform(-40, 40, (2, 4000))], 1)
+    points = np.stack([np.zeros(4000), *np.random.default_rng(1).uniform(-40, 40, (2, 4000))], 1)
     for draw in range(12):
         patch = dataclasses.replace(skin.draw_patch(np.random.default_rng(draw)), peaks=True)
         peaks, pits = patch.relief_mm(points), dataclasses.replace(patch, peaks=False).relief_mm(points)

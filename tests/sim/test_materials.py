@@ -101,8 +101,7 @@ def test_contact_is_that_of_the_closed_form():
         known = {"force_n": force, "stiffness": 1e9, "pixel_mm": 0.1, "dome_radius_mm": 20.0}
         return contact(pressure(relief.astype(np.float32), **known), pixel_mm=0.1)
 
-    depth = np.sqrt(1.5 / (np.pi * GEL_STIFFNESS * 20.0))
-    flat = pressed(np.zeros((301, 301)))
+    depth, flat = np.sqrt(1.5 / (np.pi * GEL_STIFFNESS * 20.0)), pressed(np.zeros((301, 301)))
     assert flat["depth_mm"] == pytest.approx(depth, rel=0.01)
     assert flat["patch_mm2"] == pytest.approx(2 * np.pi * 20.0 * depth, rel=0.02)
     assert (flat["contact_x_mm"], flat["contact_y_mm"]) == pytest.approx((0, 0), abs=1e-6)

@@ -82,8 +82,7 @@ def test_auto_on_gpus(capability: tuple[int, int], expected: str, monkeypatch: p
 def test_auto_is_the_faster_one_where_both_are_computed(slower: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """A Xeon without AMX computes bf16 itself, and more slowly than fp32."""
     monkeypatch.setattr(devices, "has_bf16", lambda device: True)
-    clock = iter(range(10**6))
-    now = [0.0]
+    clock, now = iter(range(10**6)), [0.0]
     monkeypatch.setattr(devices.time, "perf_counter", lambda: now[0])
 
     def work() -> None:
@@ -105,16 +104,14 @@ def test_what_auto_became_is_printed_and_kept(
     out = train(asked, tmp_path / "r", validate=False)
     assert f"precision: {became} (auto" in capsys.readouterr().out
     run, record = load_run(out)
-    assert (run.precision, record["precision"]) == ("auto", became)
-    assert mvitac.load(out).run.precision == became
+    assert (run.precision, record["precision"]) == ("auto", became) and mvitac.load(out).run.precision == became
     assert train(replace(asked, precision=became), tmp_path / "explicit", quiet=True, validate=False)  # type: ignore[arg-type]
     assert_equal_weights(out, tmp_path / "explicit")
     assert not capsys.readouterr().out
     # Another machine decides anew, and what is finished stays what it is.
     hardware(not own)
     again = ["pretrain", "--from", str(out / "run.json"), "--quiet", "--steps", "1", "--out", str(tmp_path / "again")]
-    assert main(again) == 0
-    assert load_run(tmp_path / "again")[1]["precision"] == ("fp32" if own else "bf16")
+    assert main(again) == 0 and load_run(tmp_path / "again")[1]["precision"] == ("fp32" if own else "bf16")
     assert train(asked, out, resume=True, quiet=True) == out
 
 

@@ -52,8 +52,7 @@ def test_leaves_the_promised_files(smoke_run: Path) -> None:
 @pytest.mark.parametrize("stop_after", [3, 7])
 def test_stopped_and_resumed_equals_straight(pack: Pack, smoke_run: Path, tmp_path: Path, stop_after: int) -> None:
     """Also across a change of epoch, with dropout, and with a checkpoint older than the stop."""
-    run = cut_after(stop_after, pack, tmp_path / "r")
-    train(run, tmp_path / "r", resume=True, quiet=True)
+    train(cut_after(stop_after, pack, tmp_path / "r"), tmp_path / "r", resume=True, quiet=True)
     assert_equal_weights(smoke_run, tmp_path / "r")
     steps = [line["step"] for line in log_of(tmp_path / "r")]
     assert steps == sorted(steps) and steps.count(8) == 2  # one step line, one eval line, nothing twice
@@ -149,8 +148,7 @@ def command(pack: Pack, out: Path) -> list[str]:
 @pytest.mark.slow
 def test_sigkill_at_random_moments(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
     """Killed with SIGKILL twice at random steps, then resumed: the weights of the run that was not."""
-    out, rng = tmp_path / "killed", random.Random()
-    killed = 0
+    out, rng, killed = tmp_path / "killed", random.Random(), 0
     for goal in sorted(rng.sample(range(1, 7), 2)):
         process = begin(main, command(pack, out))
         while process.is_alive():
@@ -168,8 +166,7 @@ def test_sigkill_at_random_moments(pack: Pack, smoke_run: Path, tmp_path: Path) 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
     """In a process of its own: libraries of other tests may leave one in which no signal can be handled."""
-    process = begin(stopped_at_four, pack.path, tmp_path / "r", output=tmp_path / "said")
-    finish(process, tmp_path / "said")
+    finish(begin(stopped_at_four, pack.path, tmp_path / "r", output=tmp_path / "said"), tmp_path / "said")
     assert f"after step 4 of 8; {tmp_path / 'r'} continues with resume" in (tmp_path / "said").read_text()
     assert torch.load(tmp_path / "r" / "checkpoint.pt", weights_only=True)["step"] == 4
     train(smoke(pack), tmp_path / "r", resume=True, quiet=True)
@@ -228,8 +225,7 @@ def test_spread_has_no_tail_of_duplicates() -> None:
     groups = rng.permutation(np.repeat(np.arange(300), np.ceil(5 * np.exp(rng.normal(0, 1, 300))).astype(int)))
 
     def duplicates(order: np.ndarray) -> np.ndarray:
-        batches = groups[order[: len(order) // 64 * 64]].reshape(-1, 64)
-        return np.array([64 - len(set(batch)) for batch in batches])
+        return np.array([64 - len(set(batch)) for batch in groups[order[: len(order) // 64 * 64]].reshape(-1, 64)])
 
     spread, plain = (duplicates(epoch_order(len(groups), use, 1, spread=True)) for use in (groups, None))
     first, second = (epoch_order(len(groups), groups, epoch, spread=True) for epoch in (1, 2))
@@ -244,8 +240,7 @@ def test_spread_has_no_tail_of_duplicates() -> None:
 def test_the_spread_sampler_spreads(pack: Pack) -> None:
     run, rows = smoke(pack, sampler="spread"), pack.rows("train")
     order = epoch_order(len(rows), pack.touch_groups[rows], combine_seeds(run.seed, 1, 0), spread=True)
-    per_epoch = run.steps_per_epoch(len(rows))
-    found = np.concatenate(list(batches(run, pack, rows, 0, per_epoch)))
+    found = np.concatenate(list(batches(run, pack, rows, 0, run.steps_per_epoch(len(rows)))))
     assert np.array_equal(found, rows[order[: len(found)]])
 
 

@@ -48,13 +48,11 @@ def drawn(run: Any, epochs: int = 1) -> tuple[Any, np.ndarray]:
 
 def test_a_plain_mix_trains_as_one_pack_of_the_same_rows(pack: Pack, parts: dict[str, str], tmp_path: Path) -> None:
     whole = train(smoke(pack, steps=4), tmp_path / "whole", quiet=True)
-    run = mix_run(parts["a"], parts["b"], steps=4)
-    assert_equal_weights(whole, train(run, tmp_path / "mix", quiet=True))
+    assert_equal_weights(whole, train(mix_run(parts["a"], parts["b"], steps=4), tmp_path / "mix", quiet=True))
 
 
 def test_weights_decide_what_is_drawn(parts: dict[str, str]) -> None:
-    run = mix_run(f"{parts['a']}:1", f"{parts['b']}:3", batch_size=8)
-    pack, found = drawn(run, epochs=40)
+    pack, found = drawn(mix_run(f"{parts['a']}:1", f"{parts['b']}:3", batch_size=8), epochs=40)
     assert pack.shares(pack.rows("train")).tolist() == [0.25, 0.75]
     assert np.mean(pack.part_of[found] == 1) == pytest.approx(0.75, abs=0.03)
     rows = pack.rows("train")
@@ -67,8 +65,7 @@ def test_weights_decide_what_is_drawn(parts: dict[str, str]) -> None:
 def test_stopped_and_resumed_equals_straight(parts: dict[str, str], tmp_path: Path) -> None:
     """With a part that lacks the camera; across a change of epoch; scores of every part are logged."""
     given = (f"{parts['a']}:1", f"{parts['gel']}:2")
-    run = mix_run(*given, steps=8, checkpoint_every=2, log_every=1)
-    out = train_twice(run, tmp_path, cut=5)
+    out = train_twice(mix_run(*given, steps=8, checkpoint_every=2, log_every=1), tmp_path, cut=5)
     values = next(line["eval"] for line in reversed(log_of(tmp_path / "straight")) if "eval" in line)
     shown = {"a vision/linear pattern", "a touch/linear a/bright", "a vision->touch R@5", "gel touch/linear pattern"}
     assert shown <= values.keys() and not any(name.startswith("gel") and "vision" in name for name in values)
@@ -92,8 +89,7 @@ def test_views_are_of_the_rows_that_have_the_modality(parts: dict[str, str]) -> 
 
 def ragged(method: Any, vision: int = 5, touch: int = 8) -> Views:
     """``touch`` rows, of which ``vision`` have a camera image, and one row with the camera alone."""
-    generator = torch.Generator().manual_seed(3)
-    num = {"vision": vision + 1, "touch": touch}
+    generator, num = torch.Generator().manual_seed(3), {"vision": vision + 1, "touch": touch}
     images = {m: [torch.randn(n, 3, 32, 32, generator=generator) for _ in range(method.views)] for m, n in num.items()}
     both = {"vision": torch.arange(vision), "touch": torch.arange(touch - vision, touch)}
     return Views(images=images, labels={}, rows=torch.arange(3, touch + 4), both=both)
@@ -125,8 +121,7 @@ def test_inter_modal_losses_are_of_whole_pairs() -> None:
     for changes in ({}, {"keys": "end-to-end", "pairs": "all"}):
         method: Any = build("mvitac", config=replace(small("mvitac"), **changes))
         batch = ragged(method)
-        losses = method(batch)
-        z = method.queries(batch) | method.keys(batch)
+        losses, z = method(batch), method.queries(batch) | method.keys(batch)
         keys = "q" if changes else "k"
         at = batch.both
         for part, (x, y) in {"vt": ("vision", "touch"), "tv": ("touch", "vision")}.items():
@@ -150,8 +145,7 @@ def test_a_method_that_needs_whole_pairs_names_the_rows(parts: dict[str, str], n
     with pytest.raises(ValueError, match=message):
         train(run, tmp_path / "run", quiet=True)
     assert not (tmp_path / "run").exists()
-    whole = with_method(mix_run(parts["a"], parts["b"], steps=1, eval_every=0), name)
-    train(whole, tmp_path / "whole", quiet=True)
+    train(with_method(mix_run(parts["a"], parts["b"], steps=1, eval_every=0), name), tmp_path / "whole", quiet=True)
 
 
 def test_rows_without_a_loss_are_not_drawn_and_those_with_one_are(parts: dict[str, str], tmp_path: Path) -> None:
@@ -160,8 +154,7 @@ def test_rows_without_a_loss_are_not_drawn_and_those_with_one_are(parts: dict[st
     assert isinstance(pack, MixedPack)
     cases: Any = ((("vv",), 1), (("tt",), 2), (("vt", "tv"), 1), (("vv", "tt"), 2))
     for losses, num in cases:
-        rows = MViTacConfig(losses=losses).training_rows(pack)
-        assert set(pack.part_of[rows]) == set(range(num))
+        assert set(pack.part_of[MViTacConfig(losses=losses).training_rows(pack)]) == set(range(num))
     by_touch = SupervisedConfig(modalities=("touch",), tasks=("pattern",))
     assert np.array_equal(by_touch.training_rows(pack), pack.rows("train", "val"))
     with pytest.raises(ValueError, match="method 'mvitac' learns from no row of part gel: leave it out"):
@@ -186,8 +179,7 @@ def test_a_run_on_a_mix_is_probed_by_task(parts: dict[str, str], tmp_path: Path)
     """A task of one part is of its rows alone, a common one of all rows with the modality; a control where it is known."""
     run = mix_run(parts["a"], parts["gel"], steps=1, eval_every=0)
     out = train(run, tmp_path / "run", quiet=True)
-    result = probe_runs([out], ProbeConfig())
-    pack = run.data.open()
+    result, pack = probe_runs([out], ProbeConfig()), run.data.open()
     records = [r for r in result["records"] if r["source"] == "mvitac"]
     own = {r["task"]: r["num_test"] for r in records if r["modality"] == "touch"}
     num = [len(part.rows("test")) for part in pack.parts.values()]

@@ -68,8 +68,7 @@ def test_from_training_to_the_exported_model(pack: Pack, file: Path, tmp_path: P
 
     scores = probe_runs([tmp_path / "cut"], ProbeConfig(probes=("linear",)), pack)["records"]
     assert {r["modality"] for r in scores if r.get("source") == "mvitac"} == {"vision", "touch", "both"}
-    own = {r["modality"] for r in scores if r["source"] == "start"}
-    assert own == {"vision"}  # touch starts from random weights
+    assert {r["modality"] for r in scores if r["source"] == "start"} == {"vision"}  # touch starts from random weights
     assert {r["modality"] for r in scores if r["source"] == "imagenet"} == {"vision", "touch", "both"}
     model = mvitac.load(tmp_path / "cut")
     graph = ExportModule(model)  # what is exported
@@ -140,8 +139,7 @@ def test_features_of_all_stages() -> None:
 
 def test_the_untrained_control_keeps_a_locked_tower(pack: Pack, file: Path) -> None:
     """It is the run before its first step, so the gain by both senses is that of training."""
-    run = started(pack, file, locked=True)
-    trained = started(pack, file)
+    run, trained = started(pack, file, locked=True), started(pack, file)
     kept, fresh = _untrained(run, [run]).encoder, _untrained(trained, [trained]).encoder
     assert _untrained(run, [run, trained]).encoder.vision.weights == SCRATCH  # a control for both
     assert kept.vision == run.encoder.vision and {kept.touch.weights, fresh.vision.weights} == {SCRATCH}
@@ -166,8 +164,7 @@ def test_kept_norms_of_one_trunk() -> None:
         m: {x.training for x in found if isinstance(x, torch.nn.BatchNorm2d)}  # type: ignore[union-attr]
         for m, found in layers.items()
     }
-    assert training == {"vision": {False}, "touch": {True}}
-    assert all(p.requires_grad for p in method.query.parameters())
+    assert training == {"vision": {False}, "touch": {True}} and all(p.requires_grad for p in method.query.parameters())
 
 
 def test_what_cannot_be_locked_is_said(pack: Pack) -> None:

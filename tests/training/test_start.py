@@ -155,8 +155,7 @@ def test_other_weights_are_refused_at_resume(pack: Pack, smoke_run: Path, tmp_pa
 @pytest.fixture(scope="module")
 def chain(pack: Pack, turned: Pack, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """b learned from the rows that the striped pairs test; c started from b, and d from the artifact of c."""
-    folder = tmp_path_factory.mktemp("chain")
-    run = smoke(pack, steps=1, eval_every=0)
+    folder, run = tmp_path_factory.mktemp("chain"), smoke(pack, steps=1, eval_every=0)
     runs = {"b": train(replace(run, data=PackConfig(path=turned.path)), folder / "b", quiet=True)}
     runs["c"] = train(replace(run, init=Init(path=runs["b"])), folder / "c", quiet=True)
     runs["art"] = publish(runs["c"], folder / "art", allow_leak=True)

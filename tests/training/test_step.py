@@ -73,8 +73,7 @@ def test_gradient_caching_is_exact_without_batchnorm_statistics(config: MethodCo
     """With BatchNorm in eval mode no pair sees another: cached in any chunks = direct, losses, gradients and memory."""
     run = replace(RUN, method=config, encoder=TINY_VIT if config.needs_vit else RUN.encoder)
     direct, cached = build(run, norm=False), build(run, norm=False)
-    a = take(run, direct, [lambda: views()])
-    assert_close(a, take(run, cached, split(views(), size)), 1e-5)
+    assert_close(take(run, direct, [lambda: views()]), take(run, cached, split(views(), size)), 1e-5)
     assert_close(gradients(direct), gradients(cached), 1e-4)
     remembered = [
         {k: v for k, v in m.state_dict().items() if k.startswith(("banks", "queues", "centre"))}
@@ -93,12 +92,10 @@ def test_gradient_caching_is_exact_with_batchnorm_and_dropout_chunk_by_chunk() -
         torch.manual_seed(i)
         z.append(direct.queries(part()))
         keys.append(direct.keys(part()))
-    joined = {name: torch.cat([one[name] for one in many]) for many in (z, keys) for name in many[0]}
-    losses = direct.contrast(joined)
+    losses = direct.contrast({name: torch.cat([one[name] for one in many]) for many in (z, keys) for name in many[0]})
     losses["loss"].backward()
     torch.manual_seed(9)
-    found = take(RUN, cached, parts)
-    assert_close({n: v.detach() for n, v in losses.items()}, found, 1e-5)
+    assert_close({n: v.detach() for n, v in losses.items()}, take(RUN, cached, parts), 1e-5)
     assert_close(gradients(direct), gradients(cached), 1e-4)
     assert {int(b) for name, b in cached.query.named_buffers() if "num_batches" in name} == {3}
     for name, buffer in direct.query.named_buffers():
@@ -156,11 +153,9 @@ def test_a_compiled_step_is_one_graph(monkeypatch: pytest.MonkeyPatch, name: str
 def test_layers_nearer_the_images_learn_more_slowly(decay_norms: bool) -> None:
     """layer_decay .5: decoders at full rate, the last block and its norm at half of it, the one before at half of that."""
     run = replace(RUN, method=small("mae"), encoder=TINY_VIT.changed(layer_decay=0.5))
-    optim = Optim(name="sgd", weight_decay=0.1, decay_norms=decay_norms)
-    method = build(run)
+    optim, method = Optim(name="sgd", weight_decay=0.1, decay_norms=decay_norms), build(run)
     before = {name: p.clone() for name, p in method.named_parameters()}
-    step = Step(replace(run, optim=optim), method, CPU)
-    step([views], lr=1e-2, seed=0, progress=0.5)
+    Step(replace(run, optim=optim), method, CPU)([views], lr=1e-2, seed=0, progress=0.5)
     shares = {"norm.": 0.5, "blocks.1.": 0.5, "blocks.0.": 0.25, "patch_embed.": 0.125, "pos_embed": 0.125}
     for name, p in method.named_parameters():
         layer = name.removeprefix("trunks.vision.").removeprefix("trunks.touch.")

@@ -124,8 +124,7 @@ def test_few_groups_of_val_tell_nothing(num: int) -> None:
 
 def test_values_have_r2(measured: Pack) -> None:
     run = smoke(measured)
-    model = fresh(run, measured.spec, measured.size)
-    values, cells = validate(model, measured, run)
+    values, cells = validate(fresh(run, measured.spec, measured.size), measured, run)
     light, both = cells["touch/linear light"], cells["touch/linear both"]
     assert light.shape[0] == 1 and both.shape[0] == 2
     errors, guess = light[0].sum(0).tolist()
@@ -179,8 +178,7 @@ def test_while_training_a_table_shows_each_evaluation(
     for row, values in ((heads[0] + 2, start), (heads[0] + 3, second), (heads[1] + 2, last)):
         names = [[f"both/linear {task}"] for task in tasks] + [["vision->touch R@5", "touch->vision R@5"]]
         scores = [100 * np.mean([values[name] for name in keys]) for keys in names]
-        before = [100 * start[keys[0]] for keys in names[:-1]]
-        cells = said[row].split()
+        before, cells = [100 * start[keys[0]] for keys in names[:-1]], said[row].split()
         shown = cells[1:6] if values is start else cells[3:8]
         assert shown == [f"{score:.1f}" for score in scores]
         assert values is start or cells[-1] == f"{np.mean(scores[:-1]) - np.mean(before):+.1f}"

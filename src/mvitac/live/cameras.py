@@ -179,8 +179,7 @@ class Simulated(Source):
     def read(self) -> np.ndarray:
         from mvitac.sim import gel, materials
 
-        when = max(0.0, self.number / self.fps - self.first + self.rest)
-        touch, phase = divmod(when, self.rest + self.hold)
+        touch, phase = divmod(max(0.0, self.number / self.fps - self.first + self.rest), self.rest + self.hold)
         if int(touch) != self.touch:
             self.touch = int(touch)
             rng = np.random.default_rng([self.seed, self.touch])

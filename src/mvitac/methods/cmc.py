@@ -96,8 +96,7 @@ class CMC(Contrastive):
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         assert len(self.rows), "call prepare(rows) first"
         at = torch.searchsorted(self.rows, z["rows"])
-        num = self.config.negatives(len(self.rows))
-        drawn = torch.randint(len(self.rows), (len(at), num + 1), device=at.device)
+        drawn = torch.randint(len(self.rows), (len(at), self.config.negatives(len(self.rows)) + 1), device=at.device)
         drawn[:, 0] = at  # the positive
         vision, touch = cast(Bank, self.banks["vision"]), cast(Bank, self.banks["touch"])
         with torch.autocast(at.device.type, enabled=False):

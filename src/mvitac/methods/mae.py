@@ -50,8 +50,7 @@ class MAEConfig(MethodConfig):
 def split_patches(noise: Float[Tensor, "B N"], mask_ratio: float) -> tuple[Int[Tensor, "B K"], Int[Tensor, "B N-K"]]:
     """The patches with the least noise, K = int(N (1 - mask_ratio)) of them, and the others; one at least of each."""
     num = noise.shape[1]
-    visible = min(max(1, int(num * (1 - mask_ratio))), num - 1)
-    order = noise.argsort(dim=1)
+    visible, order = min(max(1, int(num * (1 - mask_ratio))), num - 1), noise.argsort(dim=1)
     return order[:, :visible], order[:, visible:]
 
 

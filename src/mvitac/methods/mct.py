@@ -78,8 +78,7 @@ class MCT(MViTac):
             head = "intra" if x == y else "inter"
             query, key, queue = z["q", x, 0, head], z["k", y, 1, head], self.queue(y, head).keys
             losses[part] = queue_nce(query, key, queue, tau) if x == y else hinge(query, key, queue, margin)
-        loss = losses["vv"] + losses["tt"] + self.mct.lambda_inter * (losses["vt"] + losses["tv"])
-        return {"loss": loss, **losses}
+        return {"loss": losses["vv"] + losses["tt"] + self.mct.lambda_inter * (losses["vt"] + losses["tv"]), **losses}
 
     def queue(self, modality: str, head: str) -> Queue:
         return self.queues[f"{modality}_{head}"]  # type: ignore[return-value]

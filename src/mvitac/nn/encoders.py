@@ -233,8 +233,7 @@ class PerFrame(nn.Module):
         self.num_features = num_features(trunk)
 
     def forward(self, images: Tensor) -> Tensor:
-        each = images.unflatten(1, (self.frames, -1)).flatten(0, 1)
-        return self.trunk(each).unflatten(0, (-1, self.frames)).mean(1)
+        return self.trunk(images.unflatten(1, (self.frames, -1)).flatten(0, 1)).unflatten(0, (-1, self.frames)).mean(1)
 
 
 def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:

@@ -15,8 +15,7 @@ def info_nce(query: Float[Tensor, "B D"], key: Float[Tensor, "B D"], temperature
     """
     with torch.autocast(query.device.type, enabled=False):
         query, key = F.normalize(query.float(), dim=1), F.normalize(key.float(), dim=1)
-        logits = query @ key.T / temperature
-        return F.cross_entropy(logits, torch.arange(len(query), device=query.device))
+        return F.cross_entropy(query @ key.T / temperature, torch.arange(len(query), device=query.device))
 
 
 def queue_nce(

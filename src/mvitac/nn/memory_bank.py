@@ -25,8 +25,7 @@ class Queue(nn.Module):
         """Replace the oldest keys by ``keys``. Of more than K keys only the last K are kept."""
         size = len(self.keys)
         keys = F.normalize(keys.float(), dim=1)[-size:]
-        at = (self.place + torch.arange(len(keys), device=keys.device)) % size
-        self.keys[at] = keys
+        self.keys[(self.place + torch.arange(len(keys), device=keys.device)) % size] = keys
         self.place.copy_((self.place + len(keys)) % size)
 
 

@@ -111,8 +111,7 @@ def encode_visible(
     ``live`` says which of ``at`` count; no token attends to the others.
     """
     vit = vit_of(trunk)
-    tokens = vit.norm_pre(vit._pos_embed(vit.patch_embed(images)))
-    front = vit.num_prefix_tokens
+    tokens, front = vit.norm_pre(vit._pos_embed(vit.patch_embed(images))), vit.num_prefix_tokens
     tokens = torch.cat([tokens[:, :front], take(tokens[:, front:], at)], dim=1)
     live = None if live is None else F.pad(live, (front, 0), value=True)
     return Tokens(vit.norm(_pass(vit.blocks, tokens, live)), at, grid_of(trunk, images), live)

@@ -64,14 +64,12 @@ def _tiles(pack: Pack, rows: Sequence[int] | np.ndarray) -> list[Tile]:
 
 def pair(pack: Pack, row: int, side: int) -> np.ndarray:
     """One row of a pack: camera, then each tactile sensor, uint8 [side, n side, 3]. A missing image is crossed out."""
-    blank = np.full((side, side, 3), MISSING, np.uint8)
-    line = np.eye(side, dtype=bool)
+    blank, line = np.full((side, side, 3), MISSING, np.uint8), np.eye(side, dtype=bool)
     blank[line | line[::-1]] = CROSS
     images = []
     for m in pack.spec.modalities:
         sensors = pack.spec.channels(m) // 3
-        there = pack.has(m)[row]
-        images += [side_by_side(fit(np.asarray(pack.images[m][row]), side))] if there else [blank] * sensors
+        images += [side_by_side(fit(np.asarray(pack.images[m][row]), side))] if pack.has(m)[row] else [blank] * sensors
     return np.concatenate(images, axis=1)
 
 

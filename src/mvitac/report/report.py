@@ -116,8 +116,7 @@ def _head(study: Study, title: str) -> Markup:
         "trunk": ", ".join(dict.fromkeys(r.run.encoder.named(modalities) for r in runs)),
         "input": ", ".join(dict.fromkeys(f"{r.run.augment.whole_of(m)} px" for r in runs for m in modalities)),
     }
-    summary = study.result["summary"]
-    text = "Nothing is scored on this data."
+    summary, text = study.result["summary"], "Nothing is scored on this data."
     if summary:
         task, first = next(iter(summary.items()))
         text = f"On {task}, {'. '.join(said)}." if (said := verdicts(first)) else ""

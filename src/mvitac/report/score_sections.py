@@ -59,8 +59,7 @@ def _scores(study: Study, summary: dict[str, Any]) -> list[Markup]:
         columns = [m for m in score_text.MODALITY_ORDER if any(m in columns_of(found) for found in tasks.values())]
         rows, muted = [], set()
         for task, found in tasks.items():
-            order = sources_of(found)
-            about = score_text.tested_on(found, study.pack.spec.group_by)
+            order, about = sources_of(found), score_text.tested_on(found, study.pack.spec.group_by)
             rows += [[f"{task} ({about})"], *score_text.score_rows(found, columns)]
             muted |= set(order) - set(study.sources)
         if rows:

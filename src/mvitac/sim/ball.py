@@ -39,13 +39,11 @@ def press_ball(seed: int, number: int, *, size: int, sensors: Sequence[Sensor], 
     """
     rng = np.random.default_rng([_TAG, seed, number])
     sensor = sensors[int(rng.random() * len(sensors))]
-    radius = BALL_MM * float(rng.uniform(0.4, 0.985))
-    place = rng.uniform(-0.46, 0.46, 2) * FIELD_MM
+    radius, place = BALL_MM * float(rng.uniform(0.4, 0.985)), rng.uniform(-0.46, 0.46, 2) * FIELD_MM
     gain, unit = float(np.exp(rng.uniform(*np.log((0.5, 1.2))))), int(rng.integers(2**31))
     pressed = imprint(2 * size, float(place[0]), float(place[1]), radius)
     draw = partial(render, sensor=sensor, rng=rng, pixel_mm=FIELD_MM / (2 * size), size=size, unit=unit, gain=gain)
-    warm = draw(pressed) * rng.normal(1.0, DRIFT, 3)
-    made: dict[str, Any] = {"touch": np.clip(warm + 0.5, 0, 255).astype(np.uint8)}
+    made: dict[str, Any] = {"touch": np.clip(draw(pressed) * rng.normal(1.0, DRIFT, 3) + 0.5, 0, 255).astype(np.uint8)}
     if background:
         made["background"] = draw(np.zeros_like(pressed))
     known = {"contact_x_mm": float(place[0]), "contact_y_mm": float(place[1]), "radius_mm": radius}

@@ -29,8 +29,7 @@ class View:
     half_fov = 0.2  # tangent of half the field of view
 
     def __init__(self, rng: np.random.Generator) -> None:
-        azimuth = np.deg2rad(-18 + rng.normal(0, 4))
-        elevation = np.deg2rad(33 + rng.normal(0, 3))
+        azimuth, elevation = np.deg2rad(-18 + rng.normal(0, 4)), np.deg2rad(33 + rng.normal(0, 3))
         distance = 0.46 * rng.uniform(0.95, 1.08)
         self.target = np.array([0.0, 0.0, 0.042]) + rng.normal(0, 0.004, 3)  # point in the centre of the picture
         flat = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation)
@@ -64,8 +63,7 @@ def _clutter(azimuth: float, rng: np.random.Generator) -> np.ndarray:
     """
     poses = np.zeros((len(objects.CLUTTER), 7))
     for pose in poses:
-        where = azimuth + np.pi + rng.uniform(-1.15, 1.15)
-        far = rng.uniform(0.15, 0.30)
+        where, far = azimuth + np.pi + rng.uniform(-1.15, 1.15), rng.uniform(0.15, 0.30)
         pose[:3] = far * np.cos(where), far * np.sin(where), rng.uniform(0.015, 0.05)
         if rng.random() < 0.7:
             pose[2] = -5.0

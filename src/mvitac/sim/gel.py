@@ -59,8 +59,7 @@ def pressure(
     count = np.arange(1, gaps.size + 1)
     approach = (force_n / spring + np.cumsum(gaps)) / count  # if exactly the first `count` pixels touch
     touching = int(np.argmax(np.append(gaps[1:], np.inf) >= approach))  # first consistent count
-    overlap = np.maximum(approach[touching] - gap, 0.0)
-    return (overlap * (spring / pixel_mm**2)).astype(np.float32)
+    return (np.maximum(approach[touching] - gap, 0.0) * (spring / pixel_mm**2)).astype(np.float32)
 
 
 def imprint(pressed: F, *, pixel_mm: float) -> F:

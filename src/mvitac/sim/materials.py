@@ -79,8 +79,7 @@ class Instance:
 
     def __init__(self, seed: int, category: int, instance: int) -> None:
         """Draw the object, which depends on the three numbers only."""
-        rng = np.random.default_rng([_TAG, seed, category, instance])
-        m = MATERIALS[category]
+        rng, m = np.random.default_rng([_TAG, seed, category, instance]), MATERIALS[category]
         soft, rough = rng.random() < m.soft, rng.random() < m.rough
         decades = rng.uniform(0.1, 0.6) if soft else -rng.uniform(0.1, 1.6)
         asperity = rng.uniform(0.3, 0.85) * (1 if rough else -1)
@@ -191,8 +190,7 @@ def outline(x: F, y: F, rng: np.random.Generator, radius: float, curl: float) ->
 def _look(thing: Instance, rng: np.random.Generator, angle: float, place: Place, size: int) -> NDArray[np.uint8]:
     """Render the object on a table with clutter under a lamp: uint8 [size, size, 3]."""
     x, y, pixel = grid(size, _CAMERA_MM * np.exp(rng.uniform(-0.25, 0.25)))
-    width = float(x.shape[0] * pixel)
-    curl = thing.curl
+    width, curl = float(x.shape[0] * pixel), thing.curl
     inside = outline(x, y, rng, rng.uniform(0.42, 0.62) * width, curl)
     texture = thing.sight(*turn(x, y, angle, place))
     lines = marks(x, y, rng, curl=curl, extent_mm=width, count=int(rng.integers(2, 4)))
@@ -228,8 +226,7 @@ def _shade(
     """Shade a height map [n, n] mm with light from direction `light`: colour [n, n, 3], Lambert plus Phong highlight."""
     lx, ly, lz = (np.float32(part) for part in light)
     gy, gx = np.gradient(height, np.float32(pixel))
-    normal = 1 / np.sqrt(1 + gx * gx + gy * gy)
-    across = lx * gx + ly * gy
+    normal, across = 1 / np.sqrt(1 + gx * gx + gy * gy), lx * gx + ly * gy
     diffuse = np.maximum((lz - across) * normal, 0)
     shine = np.maximum((lz - np.float32(0.55) * across) * normal, 0) ** 18 * np.float32(0.6 * thing.gloss)
     mix = np.clip(np.float32(0.5 * thing.contrast) * texture + np.float32(0.5), 0, 1)[..., None]
@@ -273,21 +270,17 @@ def _feel(
     """
     sensor = choice[(int(rng.random() * len(choice)) + through) % len(choice)]
     force = float(np.exp(rng.uniform(*np.log((2.0, 12.0)))))
-    gain = float(np.exp(rng.uniform(*np.log((0.5, 1.2)))))
-    dome = float(rng.uniform(18.0, 40.0))
-    tilt = rng.normal(0, 0.04, 2).astype(np.float32)
-    shear = rng.normal(0, 0.25, 2)
+    gain, dome = float(np.exp(rng.uniform(*np.log((0.5, 1.2))))), float(rng.uniform(18.0, 40.0))
+    tilt, shear = rng.normal(0, 0.04, 2).astype(np.float32), rng.normal(0, 0.25, 2)
     x, y, pixel = grid(size, _TOUCH_MM)
     u, v = turn(x, y, angle, place)
     curl = thing.curl
     # Soft objects deform, which would make their imprints shallower, so their relief is higher.
     yielding = GEL_STIFFNESS / thing.stiffness
-    amplitude = np.float32(thing.amplitude_mm * (1 + yielding) * np.exp(rng.normal(0, 0.15)))
-    relief = amplitude * thing.feel(u, v)
+    relief = np.float32(thing.amplitude_mm * (1 + yielding) * np.exp(rng.normal(0, 0.15))) * thing.feel(u, v)
     depth = np.float32(0.14 * (1 + yielding) * np.exp(rng.normal(0, 0.25)))
     relief = relief + depth * marks(x, y, rng, curl=curl, extent_mm=_TOUCH_MM, count=int(rng.integers(2, 4)))
-    inside = outline(x, y, rng, rng.uniform(0.45, 0.75) * _TOUCH_MM, curl)
-    beyond = np.maximum(-inside, 0)
+    beyond = np.maximum(-outline(x, y, rng, rng.uniform(0.45, 0.75) * _TOUCH_MM, curl), 0)
     roll = np.float32(0.2 + 1.5 * curl)
     fall = np.where(beyond < roll, beyond * beyond / (2 * roll), beyond - roll / 2)
     relief = relief - np.float32(1 + yielding) * fall

@@ -62,8 +62,7 @@ class Gel:
             for axis, g, low, high in zip((x[None], y[:, None]), (gx, gy), self.low, self.high, strict=True)
         )
         place = np.stack([u * u, v * v, u * v, u, v, np.ones_like(u)], axis=-1).astype(np.float32)
-        change = np.einsum("hwck,hwk->hwc", self.table[magnitude * _BINS + direction], place)
-        return picture + np.float32(gain) * change
+        return picture + np.float32(gain) * np.einsum("hwck,hwk->hwc", self.table[magnitude * _BINS + direction], place)
 
 
 @cache

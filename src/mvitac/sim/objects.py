@@ -51,8 +51,7 @@ class Part:
         if self.shape == "ellipsoid":
             return 4 / 3 * np.pi * float(np.prod(self.size))
         radius, half = self.size
-        ball = 4 / 3 * np.pi * radius**3 if self.shape == "capsule" else 0.0
-        return 2 * np.pi * radius**2 * half + ball
+        return 2 * np.pi * radius**2 * half + (4 / 3 * np.pi * radius**3 if self.shape == "capsule" else 0.0)
 
     def pad_radius(self) -> float:
         """Return the effective radius of curvature between the pad's dome and the part's side, in metres.
@@ -127,8 +126,7 @@ def _single(shape: str, *ranges: tuple[float, float], lying: bool = False) -> Ca
 
 def _hammer(rng: np.random.Generator) -> tuple[Part, ...]:
     r, h, x, y, z = _mm(rng, (11, 16), (45, 65), (16, 22), (7, 11), (15, 20))
-    side = rng.choice([-1, 1])
-    head = Part("box", (x, y, z), (0, side * (h + y), z), density=rng.uniform(1.0, 1.3))
+    head = Part("box", (x, y, z), (0, rng.choice([-1, 1]) * (h + y), z), density=rng.uniform(1.0, 1.3))
     return Part("cylinder", (r, h), (0, 0, z), lying=True), head
 
 
@@ -176,8 +174,7 @@ KINDS = tuple(_DRAW)  # shape kinds. Objects cycle through them, so that every s
 
 def make_thing(seed: int, index: int) -> Thing:
     """Draw object ``index`` of data seed ``seed``."""
-    rng = np.random.default_rng([OBJECT_TAG, seed, index])
-    kind = KINDS[index % len(KINDS)]
+    rng, kind = np.random.default_rng([OBJECT_TAG, seed, index]), KINDS[index % len(KINDS)]
     parts = _DRAW[kind](rng)
     return Thing(
         name=f"{kind}_{index:03d}",

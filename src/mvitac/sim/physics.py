@@ -62,8 +62,7 @@ def contact_radius_m(part: objects.Part, force_n: float, stiffness: float) -> fl
     ``stiffness`` is that of the part in N/mm^3. Part and gel are springs in series, as in :func:`mvitac.sim.gel.press`.
     """
     spring = 1e9 * stiffness * gel.GEL_STIFFNESS / (stiffness + gel.GEL_STIFFNESS)
-    radius = part.pad_radius()
-    return float(min((4 * force_n * radius / (np.pi * spring)) ** 0.25, objects.PAD_HALF_M))
+    return float(min((4 * force_n * part.pad_radius() / (np.pi * spring)) ** 0.25, objects.PAD_HALF_M))
 
 
 class Bench:
@@ -131,8 +130,7 @@ class Bench:
             data.ctrl[1] = 2 * close(time)
             good = data.qpos.copy()
             mujoco.mj_step(model, data, CHUNK)
-            warned = any(data.warning[i].number for i in _LOST)
-            if warned or not np.all(np.abs(data.qvel) < RUNAWAY):
+            if any(data.warning[i].number for i in _LOST) or not np.all(np.abs(data.qvel) < RUNAWAY):
                 mujoco.mj_resetData(model, data)
                 data.qpos[:] = good
                 mujoco.mj_forward(model, data)
@@ -141,8 +139,7 @@ class Bench:
 
     def _touch(self, side: int) -> Touch:
         """Return the sum of contact forces on a pad's dome."""
-        total = np.zeros(3)
-        force = np.zeros(6)
+        total, force = np.zeros(3), np.zeros(6)
         for i in range(self.data.ncon):
             pair = self.data.contact.geom[i]
             if self.pads[side] in pair:

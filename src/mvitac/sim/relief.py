@@ -66,8 +66,7 @@ def cells(u: F, v: F, t: NDArray[np.float32], regular: float = 0.0) -> tuple[F, 
     i, j = fu.astype(np.int32), fv.astype(np.int32)
     a, b = u - fu, v - fv
     first = np.full(u.shape, 9.0, np.float32)
-    second = first.copy()
-    owner = np.zeros(u.shape, np.int32)
+    second, owner = first.copy(), np.zeros(u.shape, np.int32)
     spread = np.float32(0.29 * (1 - regular))
     px, py = (0.5 + spread * np.clip(t[:2], -1.7, 1.7)).reshape(2, -1)
     for di in (-1, 0, 1):
@@ -135,8 +134,7 @@ def _brushed(u: F, v: F, t: F) -> F:
 
 
 def _wood(u: F, v: F, t: F) -> F:
-    bend = noise(0.22 * u, 0.45 * v, t[0])
-    ring = 0.8 * v + 0.9 * bend
+    ring = 0.8 * v + 0.9 * noise(0.22 * u, 0.45 * v, t[0])
     return _sin(ring) + 0.4 * _sin(2 * ring + 0.2) + 0.45 * noise(0.25 * u, 4 * v, t[1])
 
 
@@ -227,8 +225,7 @@ def skew(height: F, asperity: float) -> F:
     """
     sample = np.sort(height[1::5, 2::5], axis=None)
     ranks = sample[np.linspace(0, sample.size - 1, _STEPS).astype(np.int64)]
-    normal = np.interp(height, ranks, _NORMAL).astype(np.float32)
-    strength = 1.15 * abs(asperity)
+    normal, strength = np.interp(height, ranks, _NORMAL).astype(np.float32), 1.15 * abs(asperity)
     if strength < 1e-3:
         return normal
     sign = np.float32(np.sign(asperity))
@@ -246,8 +243,7 @@ def marks(x: F, y: F, rng: np.random.Generator, *, curl: float, extent_mm: float
         kink, where = rng.uniform(-0.8, 0.8), rng.uniform(-0.3, 0.3)
         cos, sin = np.float32(np.cos(angle) / extent_mm), np.float32(np.sin(angle) / extent_mm)
         u, v = cos * x + sin * y, cos * y - sin * x
-        turn = np.float32(2 * np.pi / wave)
-        deep = np.float32(curl * 0.28 * wave)
+        turn, deep = np.float32(2 * np.pi / wave), np.float32(curl * 0.28 * wave)
         path = deep * np.sin(turn * u + np.float32(2 * np.pi * phase))
         slope = deep * turn * np.cos(turn * u + np.float32(2 * np.pi * phase))
         bent = np.float32((1 - curl) * kink * 0.5)

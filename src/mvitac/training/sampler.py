@@ -125,8 +125,7 @@ def epoch_order(num: int, groups: np.ndarray | None, seed: int, *, spread: bool 
         return order
     _, inverse, counts = np.unique(groups[order], return_inverse=True, return_counts=True)
     occurrence = np.empty(num, np.int64)  # how often the row's group came before
-    firsts = np.repeat(np.cumsum(counts) - counts, counts)
-    occurrence[np.argsort(inverse, kind="stable")] = np.arange(num) - firsts
+    occurrence[np.argsort(inverse, kind="stable")] = np.arange(num) - np.repeat(np.cumsum(counts) - counts, counts)
     if not spread and counts.min() == counts.max():
         return order[np.argsort(occurrence, kind="stable")]
     start, jitter = rng.random(len(counts)), rng.uniform(-0.1, 0.1, num)
@@ -143,8 +142,7 @@ def draw_positives(
     of = "presses" if other_sensor else "touch_groups"
     groups, split = getattr(pack, of), pack.column("split")
     place = places(pack, pack.spec.window)[1] if within else np.zeros(0)
-    draws = torch.rand(len(rows), generator=generator).numpy()
-    found = rows.copy()
+    draws, found = torch.rand(len(rows), generator=generator).numpy(), rows.copy()
     for i, row in enumerate(rows):
         others = pack.rows_of(int(groups[row]), of)
         others = others[(others != row) & (split[others] == split[row]) & pack.whole[others]]

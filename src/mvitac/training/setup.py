@@ -181,8 +181,7 @@ def _hardware(run: Run, pack: Pack, device: torch.device, world: World, begun: P
         return Hardware.choose(device, precision_of(*load_run(begun)))
     measured = device.type == "cpu" and has_bf16(device)
     made = Hardware.choose(device, "auto", _trial_pass(run, pack, device) if measured else None)
-    fp32 = world.any(made.precision == "fp32")
-    return Hardware.choose(device, "fp32") if fp32 and made.precision == "bf16" else made
+    return Hardware.choose(device, "fp32") if world.any(made.precision == "fp32") and made.precision == "bf16" else made
 
 
 def _trial_pass(run: Run, pack: Pack, device: torch.device) -> Callable[[], None]:

@@ -119,8 +119,7 @@ def _linear(
         train_features, z = (found | {"both": torch.cat(list(found.values()), dim=1)} for found in (train_features, z))
     names = np.unique(pack.column("group").astype(str), return_inverse=True)[1]
     groups = torch.from_numpy(names[train_rows])
-    by_group = torch.from_numpy(np.unique(names[rows], return_inverse=True)[1])
-    cells = {}
+    by_group, cells = torch.from_numpy(np.unique(names[rows], return_inverse=True)[1]), {}
     for task in pack.spec.all_tasks:
         known, asked = _answers(pack, task, "train", train_rows), _answers(pack, task, "val", rows)
         for m in z:

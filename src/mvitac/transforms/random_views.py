@@ -109,8 +109,7 @@ def draw(config: ViewAugment, num: int, size: int, generator: torch.Generator) -
     ratio = torch.exp(uniform(num, NUM_TRIES, low=-0.28768207, high=0.28768207))  # log(3/4) to log(4/3)
     width, height = (area * ratio).sqrt().round().long(), (area / ratio).sqrt().round().long()
     fits = (width <= size) & (height <= size) & (width > 0) & (height > 0)
-    first = fits.float().argmax(dim=1, keepdim=True)
-    none = ~fits.any(dim=1)
+    first, none = fits.float().argmax(dim=1, keepdim=True), ~fits.any(dim=1)
     height, width = height.gather(1, first).squeeze(1), width.gather(1, first).squeeze(1)
     height[none] = width[none] = size
     top = (uniform(num) * (size - height + 1)).long()

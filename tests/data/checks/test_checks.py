@@ -107,8 +107,7 @@ class Presses(Source):
 
 def path_of(obj: int) -> np.ndarray:
     """[NUM_FRAMES] positions in pixels: a slide in bursts, another for every object."""
-    steps = np.random.default_rng([5, obj]).choice([0.05, 0.3, 1.6], NUM_FRAMES)
-    return np.cumsum(steps)
+    return np.cumsum(np.random.default_rng([5, obj]).choice([0.05, 0.3, 1.6], NUM_FRAMES))
 
 
 @cache
@@ -126,13 +125,11 @@ def camera(obj: int, k: int) -> np.ndarray:
 @cache
 def gel(obj: int, k: int) -> np.ndarray:
     y, x = np.mgrid[0:SIDE, 0:SIDE].astype(float)
-    rng = np.random.default_rng([3, obj])
-    left, top, wide, angle = rng.uniform((5, 9, 2, 0), (11, 23, 4, 3))
+    left, top, wide, angle = np.random.default_rng([3, obj]).uniform((5, 9, 2, 0), (11, 23, 4, 3))
     u, v = x - left - path_of(obj)[k], y - top
     u, v = u * np.cos(angle) + v * np.sin(angle), v * np.cos(angle) - u * np.sin(angle)
     bump = 80 * np.exp(-((u / wide) ** 2) - (v / (7 - wide)) ** 2) * np.sin(u + obj)
-    image = np.stack([60 + 3 * x + bump, 90 + bump, 170 - 2 * x - bump], axis=2)
-    return noisy(image, [4, obj, k])
+    return noisy(np.stack([60 + 3 * x + bump, 90 + bump, 170 - 2 * x - bump], axis=2), [4, obj, k])
 
 
 def noisy(image: np.ndarray, seed: list[int]) -> np.ndarray:
@@ -201,8 +198,7 @@ def test_classes_that_differ_in_spelling_only(pack: Pack) -> None:
 def test_a_part_of_a_source_proves_no_class_unseen(tmp_path: Path) -> None:
     rows = ["touch,label,object,split"]
     for i in range(60):
-        noise = np.random.default_rng(i).integers(0, 255, (16, 16, 3), np.uint8)
-        Image.fromarray(noise).save(tmp_path / f"{i}.png")
+        Image.fromarray(np.random.default_rng(i).integers(0, 255, (16, 16, 3), np.uint8)).save(tmp_path / f"{i}.png")
         rows.append(f"{i}.png,c{i % 10},{i},{'train' if i < 40 else 'test'}")
     (tmp_path / "m.csv").write_text("\n".join(rows))
     source = FolderConfig(path=tmp_path / "m.csv", labels=("label",), group="object", size=16).source()
@@ -251,8 +247,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
 
 
 def test_the_command_on_a_source(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rng = np.random.default_rng(0)
-    rows = ["touch,label,group,split"]
+    rng, rows = np.random.default_rng(0), ["touch,label,group,split"]
     for i in range(40):
         Image.fromarray(rng.integers(0, 256, (24, 24, 3), np.uint8)).save(tmp_path / f"{i}.png")
         rows.append(f"{i}.png,{'ab'[i % 2]},g{i // 2},{'test' if i < 10 else 'train'}")
@@ -291,8 +286,7 @@ def test_what_cannot_be_checked_is_said_and_costs_nothing(tmp_path: Path) -> Non
         return {"vision": None, "touch": both, "seq": None, "sensor": None}
 
     findings = check(altered(Presses(), touch_only, vision_channels=0, touch_channels=6), tmp_path)
-    cannot = {item for item, f in findings.items() if f.verdict == "not checkable"}
-    assert cannot == {"time offset between streams"}
+    assert {item for item, f in findings.items() if f.verdict == "not checkable"} == {"time offset between streams"}
     assert "touch 2: all in one order" in findings["red and blue swapped"].evidence
     assert exit_code(findings.values()) == 0
 
@@ -307,8 +301,7 @@ def test_missing_images_are_no_faults_of_the_others() -> None:
 
         findings = examine_source(altered(Presses(), gap), size=SIDE, quiet=True)
         told = {f.item: f for f in findings}
-        wrong = {f.item for f in findings if f.verdict in ("look", "broken")}
-        assert wrong == ({"missing images"} if fault else set())
+        assert {f.item for f in findings if f.verdict in ("look", "broken")} == ({"missing images"} if fault else set())
         assert f"{64 if fault else 107} of 320" in told["missing images"].evidence
     assert "no row of test has vision" in told["missing images"].evidence
 
@@ -396,8 +389,7 @@ def test_resized_copies_in_another_pack_are_found(tmp_path: Path, objects: str) 
         return {"vision": vision, "touch": touch, **names}
 
     one, other = (tmp_path / name for name in ("one", "other"))
-    first = altered(Presses(), lambda _, item: {"touch": seen(*divmod(item, NUM_FRAMES))})
-    build(first, one, size=SIDE, quiet=True)
+    build(altered(Presses(), lambda _, item: {"touch": seen(*divmod(item, NUM_FRAMES))}), one, size=SIDE, quiet=True)
     build(altered(Presses(), renamed, name="renamed"), other, size=SIDE, quiet=True)
     file = tmp_path / "found.json"
     assert main(["data", "check", str(one), str(other), "--json", str(file)]) in (0, 1)

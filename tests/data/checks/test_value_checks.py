@@ -62,8 +62,7 @@ class Recordings(Source):
             force = float("nan")
         columns = {"id": f"{k:02d}-{i:02d}", "group": str(k), "touch_group": str(k), "seq": i}
         columns |= {"split": "test" if k in TEST else "train", "force_n": force, "tilt": tilt}
-        image = rng.integers(0, 255, (16, 16, 3), np.uint8)
-        return [Sample(vision=None, touch=image, columns=columns)]
+        return [Sample(vision=None, touch=rng.integers(0, 255, (16, 16, 3), np.uint8), columns=columns)]
 
 
 def packed(path: Path, fault: str = "") -> Pack:

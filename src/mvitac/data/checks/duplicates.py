@@ -21,8 +21,7 @@ def exact_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     notes, rows = [], []
     for name, one in looks.items():
         _, first, numbers = np.unique(one.exact, return_index=True, return_inverse=True)
-        different = sides != sides[first[numbers]]
-        across = np.flatnonzero(np.isin(numbers, numbers[different]) & one.seen)
+        across = np.flatnonzero(np.isin(numbers, numbers[sides != sides[first[numbers]]]) & one.seen)
         if len(across):
             notes.append(f"{name}: {share(len(across), pack.num)} rows have a copy in another split")
             rows += across[np.argsort(numbers[across], kind="stable")].tolist()
@@ -38,8 +37,7 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     the most similar rows of two *groups inside train*, at most ``NEAR``. The fraction of train rows above it measures
     how similar rows of this dataset are by nature, for example frames without contact.
     """
-    sides = sides_of(pack.column("split").astype(str))
-    groups = pack.column("group").astype(str)
+    sides, groups = sides_of(pack.column("split").astype(str)), pack.column("group").astype(str)
     notes, rows, suspicious, compared = [], [], False, False
     for name, one in looks.items():
         held_out = one.has & (sides != "train")

@@ -48,8 +48,7 @@ class _Some(Source):
 
 def examine(pack: Pack, *, part: bool = False) -> list[Finding]:
     """Run every check on ``pack``. Classes that a ``part`` of a source lacks may be in the rest: not "broken"."""
-    looks = look_at(pack)
-    labels = [*table_checks.labels(pack), *value_checks.values(pack)]
+    looks, labels = look_at(pack), [*table_checks.labels(pack), *value_checks.values(pack)]
     if part:
         milder = [replace(f, verdict="look", evidence="in the items examined: " + f.evidence) for f in labels]
         labels = [mild if f.verdict == "broken" else f for f, mild in zip(labels, milder, strict=True)]

@@ -21,8 +21,7 @@ def constant_frames(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     notes = [f"{m}: {share(len(r), pack.num)}, first {pack.column('id')[r[0]]}" for m, r in found.items() if len(r)]
     evidence = "; ".join(notes) or f"none among {pack.num} rows"
     advice = "look whether the sensor or the decoder failed, and leave these rows out"
-    broken = len(rows) > 0.05 * pack.num
-    return judged("constant frames", evidence, advice, rows, look=bool(rows), broken=broken)
+    return judged("constant frames", evidence, advice, rows, look=bool(rows), broken=len(rows) > 0.05 * pack.num)
 
 
 def red_and_blue(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
@@ -109,16 +108,14 @@ def motion_correlations(pack: Pack, looks: dict[str, ImageStats], when: np.ndarr
     order = np.lexsort((when, groups))
     for rows in np.split(order, np.flatnonzero(np.diff(groups[order])) + 1):
         rows = rows[np.isfinite(when[rows]) & both[rows]]
-        num_blocks = max(1, len(rows) // BLOCK)
-        for block in np.array_split(rows, num_blocks):
+        for block in np.array_split(rows, max(1, len(rows) // BLOCK)):
             if len(block) < 2 * MAX_LAG + 3:
                 continue
             energy = [np.log1p(np.abs(np.diff(light[m][block], axis=0)).mean((1, 2))) for m in ("vision", "touch")]
             if min(e.std() for e in energy) < 1e-3:
                 continue  # a still camera, or repeated frames
             z = [(e - e.mean()) / e.std() for e in energy]
-            n = len(z[0])
-            lags = range(-MAX_LAG, MAX_LAG + 1)
+            n, lags = len(z[0]), range(-MAX_LAG, MAX_LAG + 1)
             pairs = ((z[0][max(0, -k) : n - max(0, k)], z[1][max(0, k) : n + min(0, k)]) for k in lags)
             curves.append([float(np.mean(a * b)) for a, b in pairs])
     return np.array(curves).reshape(-1, 2 * MAX_LAG + 1)

@@ -37,8 +37,7 @@ class ImageStats:
     @property
     def gray(self) -> np.ndarray:
         """bool [N], whether the three channels are equal."""
-        span = self.thumbs.max(axis=3).astype(int) - self.thumbs.min(axis=3)
-        return span.max(axis=(1, 2)) <= 2
+        return (self.thumbs.max(axis=3).astype(int) - self.thumbs.min(axis=3)).max(axis=(1, 2)) <= 2
 
 
 def look_at(pack: Pack) -> dict[str, ImageStats]:

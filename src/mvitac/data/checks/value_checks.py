@@ -114,8 +114,7 @@ def time_shift(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     item = "time shift between images and values"
     if not (touches := _touches(pack)):
         return Finding(item, "not checkable", "no column that orders the rows")
-    modality = pack.spec.modalities[-1]
-    change = np.zeros(pack.num)
+    modality, change = pack.spec.modalities[-1], np.zeros(pack.num)
     for light in (look.light for look in looks.values() if look.modality == modality):
         for rows in touches:
             change[rows] += abs(light[rows] - light[rows[0]]).mean((1, 2))
