@@ -391,8 +391,7 @@ def test_a_recording_survives_a_crash(tmp_path: Path) -> None:
         Recorder(out)
     exec(re.search('"(.*)"', str(refused.value))[1])  # type: ignore[index]
     pack = Pack(out)
-    assert pack.num == 128
-    assert np.array_equal(pack.images["touch"][:, 0, 0, 0], pack.column("time").astype(float))
+    assert pack.num == 128 and np.array_equal(pack.images["touch"][:, 0, 0, 0], pack.column("time").astype(float))
 
 
 def test_a_recording_that_nothing_came_of_is_not_in_the_way(tmp_path: Path) -> None:

@@ -123,13 +123,11 @@ def test_topics_that_the_model_does_not_take(onnx: Path, monkeypatch: pytest.Mon
 @pytest.mark.parametrize("encoding", ["mono8", "rgb8", "bgr8", "rgba8", "bgra8", "compressed"])
 def test_an_image_is_read_as_rgb(encoding: str) -> None:
     image = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
-    if encoding == "mono8":
-        image[..., 1:] = image[..., :1]
     pixels = image[..., ::-1] if encoding.startswith("bgr") else image
     if encoding.endswith("a8"):
         pixels = np.dstack([pixels, np.full((4, 6), 9, np.uint8)])
     if encoding == "mono8":
-        pixels = image[..., :1]
+        image[..., 1:] = pixels = image[..., :1]
     topic = load_node().Topic("/gel")
     topic.message = compressed(7.5, image) if encoding == "compressed" else raw(7.5, pixels, encoding)
     assert np.array_equal(topic.read(), image) and topic.captured == START + 7.5

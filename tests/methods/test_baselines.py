@@ -36,11 +36,7 @@ from support.training_runs import smoke
 
 def unit(x: torch.Tensor) -> list[list[float]]:
     """Rows of ``x`` L2-normalised, as plain numbers."""
-    rows = []
-    for row in x.tolist():
-        length = math.sqrt(sum(v * v for v in row))
-        rows.append([v / length for v in row])
-    return rows
+    return [[v / math.hypot(*row) for v in row] for row in x.tolist()]
 
 
 def dot(a: list[float], b: list[float]) -> float:
@@ -141,8 +137,7 @@ def test_moco_contrasts_with_the_queue_then_fills_it() -> None:
     found = outcome(method, batch)
     for modality in ("vision", "touch"):
         q = method.towers[modality](batch.images[modality][0])
-        expected = queue_nce(q, keys[modality], queues[modality], 0.2)
-        torch.testing.assert_close(found[modality], expected)
+        torch.testing.assert_close(found[modality], queue_nce(q, keys[modality], queues[modality], 0.2))
     before = copy.deepcopy(method.key.state_dict())
     method.after_step(0.5)
     for modality, queue in method.queues.items():
@@ -174,10 +169,8 @@ def test_mct_crosses_modalities_through_the_inter_heads() -> None:
     torch.testing.assert_close(found["vt"], hinge(query["vision"][1], key["touch"][1], queues["touch_inter"], 0.2))
     torch.testing.assert_close(found["tt"], queue_nce(query["touch"][0], key["touch"][0], queues["touch_intra"], 0.07))
     method.after_step(0.1)
-    torch.testing.assert_close(
-        method.queues["vision_inter"].keys[:8],  # type: ignore[union-attr]
-        F.normalize(key["vision"][1], dim=1),
-    )
+    pushed = method.queues["vision_inter"].keys[:8]  # type: ignore[union-attr]
+    torch.testing.assert_close(pushed, F.normalize(key["vision"][1], dim=1))
 
 
 def distance(p: torch.Tensor, t: torch.Tensor) -> float:
@@ -216,10 +209,8 @@ def test_dino_equals_a_direct_transcription() -> None:
         found = outcome(method, batch)
         for place, modality in enumerate(("vision", "touch")):
             with torch.no_grad():
-                s, t = (
-                    [tower[modality](view).tolist() for view in batch.images[modality]]
-                    for tower in (method.towers, method.teacher)
-                )
+                seen, towers = batch.images[modality], (method.towers, method.teacher)
+                s, t = ([tower[modality](view).tolist() for view in seen] for tower in towers)
             total = 0.0
             for mine, other in ((0, 1), (1, 0)):
                 for a, b in zip(s[mine], t[other], strict=True):
@@ -281,9 +272,8 @@ def test_calandra_has_a_trunk_per_stream() -> None:
     head = method.classifiers()["bright"]
     sizes = [(layer.in_features, layer.out_features) for layer in head if hasattr(layer, "in_features")]  # type: ignore
     assert sizes == [(192, 512), (512, 256), (256, 2)]
-    touch.eval()
     left, right = torch.randn(2, 3, 32, 32), torch.randn(2, 3, 32, 32)
-    z = touch(torch.cat([left, right], dim=1))
+    z = touch.eval()(torch.cat([left, right], dim=1))
     torch.testing.assert_close(z[:, :64], touch.trunks[0](left))  # type: ignore[index]
     torch.testing.assert_close(z[:, 64:], touch.trunks[1](right))  # type: ignore[index]
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -29,11 +30,8 @@ def spec(**changes: object) -> DataSpec:
 
 def cut(image: Tensor) -> np.ndarray:
     """[16, 192]: the pixels of the patches of an image [3, 32, 32], in float64."""
-    found = [
-        image[:, y : y + SIDE, x : x + SIDE].reshape(-1)
-        for y in range(0, image.shape[1], SIDE)
-        for x in range(0, image.shape[2], SIDE)
-    ]
+    corners = product(range(0, image.shape[1], SIDE), range(0, image.shape[2], SIDE))
+    found = [image[:, y : y + SIDE, x : x + SIDE].reshape(-1) for y, x in corners]
     return torch.stack(found).double().numpy()
 
 
@@ -86,10 +84,7 @@ def test_mae_is_the_mean_squared_error_of_hidden_patches(pixel_norm: bool) -> No
     batch = views(method, num=3)
     batch = replace(batch, seed=torch.tensor(11))
     found, errors = numbers(method, batch), {"vision": [], "touch": []}
-    split = {
-        m: split_patches(row_uniform(batch.seed, batch.rows, 16, stream), 0.75)
-        for stream, m in enumerate(method.trunks)
-    }
+    split = {m: split_patches(row_uniform(batch.seed, batch.rows, 16, n), 0.75) for n, m in enumerate(method.trunks)}
     for i in range(3):
         seen = {m: seen_alone(method.trunks[m], batch.images[m][0][i], split[m][0][i]) for m in errors}
         for m in ("vision", "touch"):
@@ -143,11 +138,8 @@ def test_blocks_are_a_function_of_seed_step_and_row() -> None:
     whole = multi_block(config, torch.tensor(9), rows, 0, (6, 6))
     part = multi_block(config, torch.tensor(9), rows[1:], 0, (6, 6))
     assert torch.equal(whole.context[1:], part.context) and torch.equal(whole.targets[1:], part.targets)
-    for other in (
-        multi_block(config, torch.tensor(8), rows, 0, (6, 6)),
-        multi_block(config, torch.tensor(9), rows, 1, (6, 6)),
-    ):
-        assert not torch.equal(whole.context, other.context)
+    for seed, step in ((8, 0), (9, 1)):
+        assert not torch.equal(whole.context, multi_block(config, torch.tensor(seed), rows, step, (6, 6)).context)
 
 
 def live(blocks: Blocks, row: int) -> Iterator[Tensor]:

@@ -142,9 +142,8 @@ def test_the_loss_between_sensors_written_out(keys: str) -> None:
     with torch.no_grad():
         for p in method.key.parameters():  # or confusing keys with queries would go unseen
             p.add_(0.05 * torch.randn_like(p))
-        expected = slow_info_nce(
-            query.intra(query.trunk(batch.images["touch"][0])), key.intra(key.trunk(batch.images["touch"][2])), 0.07
-        )
+        first, third = (batch.images["touch"][view] for view in (0, 2))
+        expected = slow_info_nce(query.intra(query.trunk(first)), key.intra(key.trunk(third)), 0.07)
         plain.load_state_dict(method.state_dict())
         out, without = method(batch), plain(views(plain))
     assert float(out["sensor"]) == pytest.approx(expected, rel=1e-4)

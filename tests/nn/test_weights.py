@@ -151,10 +151,7 @@ WRONG: dict[str, tuple[Callable[[State], dict[str, Any]], str]] = {
     "wider": (lambda w: w | {"bn1.weight": torch.ones(99)}, r"1 tensor \(bn1\.weight \[99\] for \[32\]\) of another"),
     "two": (lambda w: behind("encoder.", w) | behind("backbone.", w), "two sets of weights fit, below 'encoder.' and"),
     "two, one bare": (lambda w: w | behind("module.", w), "two sets of weights fit, below 'module.' and ''"),
-    "quantised": (
-        lambda w: w | {"bn1.weight": w["bn1.weight"].to(torch.int8)},
-        r"1 tensor \(bn1\.weight\) not of floats",
-    ),
+    "int8": (lambda w: w | {"bn1.weight": w["bn1.weight"].to(torch.int8)}, r"1 tensor \(bn1\.weight\) not of floats"),
     "float8": (lambda w: w | {"bn1.weight": w["bn1.weight"].to(torch.float8_e4m3fn)}, r"not of floats of 16 bits"),
     "without numbers": (lambda w: w | {"bn1.weight": w["bn1.weight"].to("meta")}, r"1 tensor \(bn1\.weight\) missing"),
     "zeros": (lambda w: {name: 0 * value for name, value in w.items()}, "weights that are all 0"),

@@ -126,10 +126,8 @@ def test_opposite_slopes_change_the_colour_oppositely(sensor):
     bare = replace(sensor, shadow=0.0, marker_pitch_mm=0.0, noise=0.0)
     x = np.linspace(-1, 1, 96, dtype=np.float32)
     ridge = 0.3 * np.exp(-((x / 0.3) ** 2))[None] * np.exp(-((x / 0.3) ** 2))[:, None]
-    levels = [
-        render(h.astype(np.float32), bare, np.random.default_rng(0), pixel_mm=0.1, unit=1).astype(float)
-        for h in (ridge, -ridge, 0 * ridge)
-    ]
+    shapes = [h.astype(np.float32) for h in (ridge, -ridge, 0 * ridge)]
+    levels = [render(h, bare, np.random.default_rng(0), pixel_mm=0.1, unit=1).astype(float) for h in shapes]
     up, down = levels[0] - levels[2], levels[1] - levels[2]
     assert np.abs(up).max() > 10
     assert np.abs(up + down).max() <= 3  # odd in slope, up to rounding and the paint's grain

@@ -315,9 +315,8 @@ def test_the_other_sensors_view_is_of_the_same_press(twice: Pack, pack: Pack) ->
     one_more = replace(run, method=MViTacConfig(hidden=32, out=16, lambda_sensor=0.5))
     assert asked(run, twice, rows)[0] == [2, 2]
     num, views = asked(one_more, twice, rows)
-    assert num == [2, 3]
     found = views["touch"][-1]
-    assert np.array_equal(twice.presses[found], twice.presses[rows])
+    assert num == [2, 3] and np.array_equal(twice.presses[found], twice.presses[rows])
     assert (twice.sensors[found] != twice.sensors[rows]).all()
     with pytest.raises(ValueError, match="rows of one press"):
         MViTacConfig(lambda_sensor=1.0).training_rows(pack)

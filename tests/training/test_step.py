@@ -75,10 +75,8 @@ def test_gradient_caching_is_exact_without_batchnorm_statistics(config: MethodCo
     direct, cached = build(run, norm=False), build(run, norm=False)
     assert_close(take(run, direct, [lambda: views()]), take(run, cached, split(views(), size)), 1e-5)
     assert_close(gradients(direct), gradients(cached), 1e-4)
-    remembered = [
-        {k: v for k, v in m.state_dict().items() if k.startswith(("banks", "queues", "centre"))}
-        for m in (direct, cached)
-    ]
+    states, kept = (direct.state_dict(), cached.state_dict()), ("banks", "queues", "centre")
+    remembered = [{k: v for k, v in state.items() if k.startswith(kept)} for state in states]
     assert (config.name in ("cmc", "moco", "mct", "dino")) == bool(remembered[0])
     for name, value in remembered[0].items():
         torch.testing.assert_close(value, remembered[1][name], rtol=1e-4, atol=1e-5)

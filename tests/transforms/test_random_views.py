@@ -7,16 +7,7 @@ import torch
 import torch.nn.functional as F
 
 from mvitac.transforms import random_views
-from mvitac.transforms.random_views import (
-    IMAGENET,
-    IMAGENET_MEAN,
-    IMAGENET_STD,
-    Drawn,
-    ViewAugment,
-    draw,
-    plain_view,
-    random_view,
-)
+from mvitac.transforms.random_views import IMAGENET, Drawn, ViewAugment, draw, plain_view, random_view
 
 
 def images(num: int = 8, channels: int = 3, side: int = 40) -> torch.Tensor:
@@ -31,7 +22,7 @@ def generator(seed: int = 0) -> torch.Generator:
 
 def denormalise(view: torch.Tensor) -> torch.Tensor:
     sensors = view.unflatten(1, (-1, 3))
-    mean, std = (torch.tensor(v).view(3, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
+    mean, std = (torch.tensor(v).view(3, 1, 1) for v in IMAGENET)
     return (sensors * std + mean).flatten(1, 2)
 
 

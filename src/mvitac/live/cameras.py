@@ -243,11 +243,8 @@ def is_recording(text: str) -> bool:
     """Whether ``text`` names a video, or a folder[@fps] with images or nothing in it."""
     path, _ = _place(crop_of(text)[0])
     files = [*path.iterdir()] if path.is_dir() else [path]
-    return (
-        not files
-        or any(file.suffix.lower() in IMAGES for file in files if path.is_dir())
-        or path.suffix.lower() in VIDEOS
-    )
+    pictures = path.is_dir() and any(file.suffix.lower() in IMAGES for file in files)
+    return not files or pictures or path.suffix.lower() in VIDEOS
 
 
 def recording(text: str) -> Recording:

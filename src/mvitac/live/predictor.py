@@ -106,8 +106,7 @@ class Live:
         self.counts: Counter[str] = Counter()
         self.ages: deque[float] = deque(maxlen=NUM_AGES)
         """Seconds from the capture of the leading frame to the answer, the latest prediction's last."""
-        self.outputs: dict[str, np.ndarray] = {}
-        """Of the engine, for the latest prediction."""
+        self.outputs: dict[str, np.ndarray] = {}  # of the engine, for the latest prediction
         self._judged: dict[str, int] = {}
         self._changed: set[str] = set()
         for stream in self.all:
@@ -204,9 +203,8 @@ class Live:
         """The frames [S, S, C] that the model looks at, newest first: ``newest``, and older ones by their time."""
         if frames_of(self.engine.window, modality) == 1:
             return [newest]
-        sensors = []
-        for stream, frame in zip(self.streams[modality], frames, strict=True):
-            sensors.append(stream.window(frame, self._back(stream), self._since[stream.name]))
+        pairs = zip(self.streams[modality], frames, strict=True)
+        sensors = [stream.window(frame, self._back(stream), self._since[stream.name]) for stream, frame in pairs]
         return [newest, *(np.concatenate(each, axis=2) for each in list(zip(*sensors, strict=True))[1:])]
 
     def _back(self, stream: Stream) -> list[float]:
@@ -256,9 +254,8 @@ class Live:
             said[own_name(task, "label", said)] = {"class": name, "confidence": confidence}
         for task, targets in self.engine.values.items():
             found = zip(targets, self.answer.values[task].tolist(), strict=True)
-            said[own_name(task, "value", said)] = {
-                t["name"]: {"value": v, "unit": t["unit"], "spread": spread_at(t, v)} for t, v in found
-            }
+            told = {t["name"]: {"value": v, "unit": t["unit"], "spread": spread_at(t, v)} for t, v in found}
+            said[own_name(task, "value", said)] = told
         return said
 
     def summary(self) -> dict[str, Any]:

@@ -36,8 +36,7 @@ class Recorder:
             raise ValueError(f"{self.spool} {still} {_command(out)}")
         self.spool.mkdir(parents=True)
         self.waiting: list[tuple[dict[str, np.ndarray], dict[str, Any]]] = []
-        self.num = 0
-        self._next = float("-inf")
+        self.num, self._next = 0, float("-inf")
 
     def __call__(self, images: dict[str, np.ndarray], columns: dict[str, Any]) -> None:
         """Keep a pair (uint8 [S, S, C]) if it is due; ``columns`` has at least time, contact and touch_number."""

@@ -82,8 +82,7 @@ class VICReg(Contrastive):
         for modality in (m for m in self.towers if (m, 0) in z):
             first, second = (z[modality, i].float() for i in (0, 1))
             with torch.autocast(first.device.type, enabled=False):
-                s = F.mse_loss(first, second)
-                v = (variance(first) + variance(second)) / 2
+                s, v = F.mse_loss(first, second), (variance(first) + variance(second)) / 2
                 c = covariance(first) + covariance(second)
             weights = self.config
             losses[modality] = weights.invariance * s + weights.variance * v + weights.covariance * c

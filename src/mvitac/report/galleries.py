@@ -50,12 +50,9 @@ def mistakes(study: Study) -> list[Markup]:
         strips = []
         for at in (sample(np.flatnonzero(wrong), NUM_QUERIES) if known else spread(values, NUM_QUERIES)).tolist():
             kinds = ("" if labels[i] < 0 else "same class" if labels[i] == labels[at] else "other" for i in near[at])
-            image, name = _picture(study, modality, int(rows[at]))
-            cells = [html.cell("asked", image, "", name)]
-            for other, kind in zip(rows[near[at]].tolist(), kinds, strict=True):
-                css, mark = _SHOWN[kind]
-                image, name = _picture(study, modality, other)
-                cells.append(html.cell(css, image, mark, name))
+            pairs = zip(rows[near[at]].tolist(), kinds, strict=True)
+            cells = [_cell(study, modality, other, *_SHOWN[kind]) for other, kind in pairs]
+            cells.insert(0, _cell(study, modality, int(rows[at]), "asked", ""))
             strips.append(html.grid(cells, "query"))
         halves.append(html.card(f"{modality}: {wrong.sum()} of {len(shown)} rows" if known else modality, strips))
     by, name = pack.spec.group_by, study.runs[0].path.name
@@ -71,9 +68,9 @@ def mistakes(study: Study) -> list[Markup]:
 _SHOWN = {"": ("", ""), "other": ("wrong", "\u2715 another class"), "same class": ("same", "\u2248 same class")}
 
 
-def _picture(study: Study, modality: str, row: int) -> tuple[Markup, str]:
+def _cell(study: Study, modality: str, row: int, css: str, mark: str) -> Markup:
     pack, label = study.pack, study.labels(np.array([row]))[0]
     group = str(pack.column("group")[row])
     name = pack.spec.tasks[0].classes[label] if label >= 0 else group
-    alt = f"{modality} of {pack.spec.group_by} {group} ({name})"
-    return picture(pack.images[modality][row], alt), f"{figures.shorten(name, 24)}; {pack.column('id')[row]}"
+    image = picture(pack.images[modality][row], f"{modality} of {pack.spec.group_by} {group} ({name})")
+    return html.cell(css, image, mark, f"{figures.shorten(name, 24)}; {pack.column('id')[row]}")

@@ -102,8 +102,7 @@ def print_classes(result: dict[str, Any], file: TextIO | None = None) -> None:
 
 def target_rows(task: dict[str, Any]) -> list[tuple[str, str, list[dict[str, Any] | None]]]:
     """Target, source, and the source's scores of that target by modality (``columns_of``), of a task with values."""
-    first = next(cell for cells in task.values() for cell in cells.values())
-    rows = []
+    first, rows = next(cell for cells in task.values() for cell in cells.values()), []
     for t, target in enumerate(first["targets"]):
         for source in sources_of(task):
             cells = [task[m].get(source) or task.get("none", {}).get(source) for m in columns_of(task)]

@@ -79,8 +79,7 @@ def photograph(bench: Bench, view: View, rng: np.random.Generator, *, size: int)
     mujoco.mj_kinematics(bench.model, bench.data)
     rays = rays_of(view.target - view.position, size * SAMPLES, view.half_fov, view.roll)
     geom, distance, normal = cast(bench, view.position, rays)
-    points = view.position + rays * distance[:, None]
-    hit = geom >= 0
+    points, hit = view.position + rays * distance[:, None], geom >= 0
     albedo, gloss, glow = _surface(bench, view, geom, points, rays)
 
     to_lamp = view.lamp - points

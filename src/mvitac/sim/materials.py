@@ -147,13 +147,12 @@ def touch(
     again = np.random.default_rng([_TAG, seed, category, instance, touch, 0, through]) if through else None
     vision = _look(thing, again or eye, angle + (again or eye).normal(0, 0.1), place, size)
     turn = angle + finger.normal(0, 0.1)
-    pressed = _feel(thing, finger, turn, place, size, choice, background, measured, through, again)
     return {
         "vision": vision,
         "category": category,
         "soft": int(thing.soft),
         "rough": int(thing.rough),
-        **pressed,
+        **_feel(thing, finger, turn, place, size, choice, background, measured, through, again),
         "stiffness": thing.stiffness,
         "amplitude_mm": thing.amplitude_mm,
         **{name: getattr(thing.feel, name) for name in ("wavelength_mm", "anisotropy", "irregularity", "asperity")},
@@ -220,9 +219,7 @@ def _look(thing: Instance, rng: np.random.Generator, angle: float, place: Place,
     return np.clip(picture + 0.5, 0, 255).astype(np.uint8)
 
 
-def _shade(
-    thing: Instance, height: F, texture: F, light: tuple[float, float, float], ambient: float, pixel: float
-) -> F:
+def _shade(thing: Instance, height: F, texture: F, light: tuple[float, ...], ambient: float, pixel: float) -> F:
     """Shade a height map [n, n] mm with light from direction `light`: colour [n, n, 3], Lambert plus Phong highlight."""
     lx, ly, lz = (np.float32(part) for part in light)
     gy, gx = np.gradient(height, np.float32(pixel))

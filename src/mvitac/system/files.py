@@ -85,8 +85,7 @@ def brief(error: BaseException) -> str:
     return line if len(line) <= 160 else f"{line[:156].rsplit(' ', 1)[0]} ..."
 
 
-SEAL = "sha256"
-"""Entry of a sealed JSON file: the ``digest`` of all others."""
+SEAL = "sha256"  # entry of a sealed JSON file: the ``digest`` of all others
 
 
 def write_json(path: Path, value: Any, *, sealed: bool = False) -> None:

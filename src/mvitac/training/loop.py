@@ -108,11 +108,12 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
 
             # Log the losses and check that they are finite, every log_every steps, as reading them waits for the GPU; and
             # once early, so that the speed is known soon.
-            early = done - start == EARLY < run.log_every
-            report = done % run.log_every == 0 or last or early
+            report = last or done % run.log_every == 0 or done - start == EARLY < run.log_every
             if report:
                 values = {name: float(value) for name, value in losses.items()}
-                _check_finite(values, done, run)
+                if not all(map(math.isfinite, values.values())):
+                    told = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+                    raise _diverged(f"the loss is not finite at step {done} ({told})", run)
                 if log:
                     log.step(done, values, lr)
 
@@ -144,12 +145,6 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
 def _check_still_there(out: Path) -> None:
     if not (out / "run.json").exists():
         raise ValueError(f"{out / 'run.json'} is gone: {out} was deleted or moved during training, start again")
-
-
-def _check_finite(losses: dict[str, float], step: int, run: Run) -> None:
-    if not all(math.isfinite(value) for value in losses.values()):
-        values = ", ".join(f"{name} {value:.4g}" for name, value in losses.items())
-        raise _diverged(f"the loss is not finite at step {step} ({values})", run)
 
 
 def _diverged(what: str, run: Run) -> Diverged:

@@ -52,8 +52,7 @@ class PartOrder:
         self.seed, self.order, self.shape, rows = batches.seed, batches.order, batches.shape, batches.rows
         self.part_of = pack.part_of
         self.rows = [rows[pack.part_of[rows] == number] for number in range(len(pack.parts))]
-        grouped = batches.touch_groups is not None
-        self.touch_groups = [pack.touch_groups[own] if grouped else None for own in self.rows]
+        self.touch_groups = [None if batches.touch_groups is None else pack.touch_groups[own] for own in self.rows]
         self.shares = pack.shares(rows)
         self.num = self.shape[0] * self.shape[1]  # draws of an epoch
         self.before = [np.zeros(len(self.rows), np.int64)]  # draws of each part before each epoch

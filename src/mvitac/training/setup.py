@@ -15,18 +15,8 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
 from mvitac.data.windows import places
 from mvitac.datasets.base import DatasetConfig
+from mvitac.evaluation import leaks
 from mvitac.evaluation.features import features
-from mvitac.evaluation.leaks import (
-    CHOSE,
-    FILE,
-    LEARNED,
-    file_source,
-    source_of,
-    sources_digest,
-    weights_files,
-    with_ancestors,
-    write_sources,
-)
 from mvitac.evaluation.sensors import sensors_of
 from mvitac.methods.base import Method
 from mvitac.model import Model, load
@@ -104,13 +94,13 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
 def _record(setup: Setup, asked: Run, out: Path, start: Start | None, taken: dict[str, Any], *, quiet: bool) -> None:
     """Write run.json and the hashes of the rows that the run learns from, and say what it starts from."""
     run, pack, val = setup.run, setup.pack, setup.pack.rows("val")
-    before = [*(start.sources if start else []), *map(file_source, weights_files(run))]
-    chose = [source_of(pack, val, CHOSE)] if len(val) else []
-    own, *others = with_ancestors(source_of(pack, setup.rows), before)
+    before = [*(start.sources if start else []), *map(leaks.file_source, leaks.weights_files(run))]
+    chose = [leaks.source_of(pack, val, leaks.CHOSE)] if len(val) else []
+    own, *others = leaks.with_ancestors(leaks.source_of(pack, setup.rows), before)
     sources = [own, *chose, *others]
     if not (out / "run.json").exists():
         record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(setup.spec)}
-        record |= {LEARNED: sources_digest(sources)}
+        record |= {leaks.LEARNED: leaks.sources_digest(sources)}
         record |= {"device": describe(setup.hardware.device), "precision": run.precision}
         record["bf16_slowdown"], said = setup.hardware.slowdown, []
         used = [m for m in setup.method.encoders() if run.encoder[m].weights == IMAGENET]
@@ -124,8 +114,8 @@ def _record(setup: Setup, asked: Run, out: Path, start: Start | None, taken: dic
         for line in [*(said if not quiet else ()), *([f"warning: {found}"] if found else ())]:
             print(f"mvitac: {line}", file=sys.stderr)
         write_json(out / "run.json", {**record, **provenance()}, sealed=True)
-    if not (out / FILE).exists():
-        write_sources(out, sources)
+    if not (out / leaks.FILE).exists():
+        leaks.write_sources(out, sources)
 
 
 def check_out(out: Path, resume: bool) -> None:

@@ -8,16 +8,7 @@ import numpy as np
 from torch import nn
 
 from mvitac.data.pack import Pack
-from mvitac.evaluation.leaks import (
-    CHOSE,
-    UNKNOWN,
-    Scored,
-    Source,
-    file_source,
-    read_sources,
-    unknown_source,
-    weights_files,
-)
+from mvitac.evaluation import leaks
 from mvitac.methods.base import Method
 from mvitac.model import BEST, load
 from mvitac.nn.encoders import within
@@ -35,7 +26,7 @@ class Start:
     trunks: dict[str, State]  # modality -> state dict
     heads: dict[str, State]  # modality -> state dict of the head into the shared space
     trunk: str  # timm name of the trunks
-    sources: list[Source]  # what its weights were trained on
+    sources: list[leaks.Source]  # what its weights were trained on
     sensors: tuple[str, ...]  # touch sensors that they met, as far as the file says
 
 
@@ -48,10 +39,10 @@ def read_start(init: Init) -> Start | None:
     heads = {m: head.state_dict() for m, head in model.projectors.items()}
     # Only the folder of a run or an artifact knows what its model learned from: a copied file is unknown.
     own = init.file.name.startswith("model.") and (folder / "run.json").exists()
-    found = read_sources(folder, "best" if init.file.name == BEST else "last") if own else None
-    learned = [unknown_source(folder.name if own else init.file.name)] if found is None else found
+    found = leaks.read_sources(folder, "best" if init.file.name == BEST else "last") if own else None
+    learned = [leaks.unknown_source(folder.name if own else init.file.name)] if found is None else found
     # Those that chose the best weights here taught whatever starts from them, its last weights, too.
-    learned = [replace(s, name=f"{s.name} of {folder.name}") if s.name.endswith(CHOSE) else s for s in learned]
+    learned = [replace(s, name=f"{s.name} of {folder.name}") if s.name.endswith(leaks.CHOSE) else s for s in learned]
     return Start(init, trunks, heads, model.run.encoder.named(model.encoders), learned, model.spec.sensors)
 
 
@@ -108,13 +99,13 @@ def describe(record: dict[str, Any]) -> str:
 
 def warning(run: Run, start: Start | None, pack: Pack) -> str:
     """A line on rows of split test that start weights were trained on, or may have been; "" if there are none."""
-    sources = [*(start.sources if start else []), *map(file_source, weights_files(run))]
+    sources = [*(start.sources if start else []), *map(leaks.file_source, leaks.weights_files(run))]
     if not sources:
         return ""
     tested = [pack.rows("test", only=task.only, by=task.split) for task in pack.spec.all_tasks] or [pack.rows("test")]
     rows = np.unique(np.concatenate(tested))
-    leak = Scored(pack).leak(sources, rows) if len(rows) else ""
-    path = start.init.path if start else ", ".join(map(str, weights_files(run)))
-    if leak == UNKNOWN:
+    leak = leaks.Scored(pack).leak(sources, rows) if len(rows) else ""
+    path = start.init.path if start else ", ".join(map(str, leaks.weights_files(run)))
+    if leak == leaks.UNKNOWN:
         return f"nothing says what {path} was trained on: leaks of test rows cannot be excluded"
     return leak and f"{path} has seen what this data tests: {leak}; `mvitac probe` will need --allow-leak"

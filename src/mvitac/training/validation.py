@@ -74,13 +74,9 @@ def validate(
     """
     if not isinstance(pack, MixedPack):
         return _validate(model, pack, run, locked)
-    values: dict[str, float] = {}
-    cells: Cells = {}
-    for part in pack.parts:
-        own, found = _validate(model, pack.alone(part), run, {})
-        values |= {f"{part} {name}": value for name, value in own.items()}
-        cells |= {f"{part} {name}": cell for name, cell in found.items()}
-    return values, cells
+    found = {part: _validate(model, pack.alone(part), run, {}) for part in pack.parts}
+    values = {f"{part} {name}": value for part, (own, _) in found.items() for name, value in own.items()}
+    return values, {f"{part} {name}": cell for part, (_, own) in found.items() for name, cell in own.items()}
 
 
 @torch.no_grad()
@@ -98,14 +94,12 @@ def _validate(model: Model, pack: Pack, run: Run, locked: Mapping[str, Tensor]) 
     rows = sample(val_rows, NUM_EVAL_VAL, rng) if held_out else train_rows[:NUM_EVAL_VAL]
     z = {m: read(m, rows) for m in model.encoders if m in modalities}
     values: dict[str, float] = {}
-    cells: Cells = {}
     for modality, features in z.items():
         values[f"{modality}/std"] = diagnostics.spread(features)
         values[f"{modality}/rankme"] = diagnostics.rank_me(features)
     values["held-out rows"] = float(held_out * len(rows))
-    if held_out:
-        cells = _linear(pack, train_rows, rows, {m: read(m, train_rows) for m in z}, z)
-        values |= {name: float(_scores(cell).mean()) for name, cell in cells.items()}
+    cells = _linear(pack, train_rows, rows, {m: read(m, train_rows) for m in z}, z) if held_out else {}
+    values |= {name: float(_scores(cell).mean()) for name, cell in cells.items()}
     if len(model.projectors) == len(z) == 2:
         values |= _shared_space(model, pack, run, rows, z)
     return values, cells
@@ -218,7 +212,6 @@ def _shared_space(model: Model, pack: Pack, run: Run, rows: np.ndarray, z: dict[
     values = {}
     for query, gallery in (("vision", "touch"), ("touch", "vision")):
         ranks = diagnostics.retrieval_ranks(shared[query], shared[gallery], groups)
-        for name, value in diagnostics.recall_at(ranks, (1, 5)).items():
-            values[f"{query}->{gallery} {name}"] = value
+        values |= {f"{query}->{gallery} {name}": value for name, value in diagnostics.recall_at(ranks, (1, 5)).items()}
     values["chance R@5"] = min(1.0, 5 / (int(groups.max()) + 1))
     return values

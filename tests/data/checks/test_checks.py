@@ -61,17 +61,13 @@ class Presses(Source):
         fault, held_out = self.fault, obj in TEST
         if fault == "unreadable" and item % 40 == 7:
             raise ValueError("broken on purpose")
-        shown, frame = obj, k
-        if fault == "copies" and held_out and k == 0:
-            shown = 0  # the very pictures of object 0
-        if fault == "near-copies" and held_out and k < 4:
-            shown = 0
-        vision = camera(shown, frame)
-        touch = gel(shown, max(0, frame - 2) if fault == "offset" else frame)
+        copied = held_out and k < {"copies": 1, "near-copies": 4}.get(fault, 0)
+        shown = 0 if copied else obj  # the very pictures of object 0
+        vision, touch = camera(shown, k), gel(shown, max(0, k - 2) if fault == "offset" else k)
         if fault == "near-copies" and shown != obj:
             noise = np.random.default_rng(item)
-            copied = [0.94 * image + 6 + noise.normal(0, 1, image.shape) for image in (vision, touch)]
-            vision, touch = (np.clip(image, 0, 255).astype(np.uint8) for image in copied)
+            changed = [0.94 * image + 6 + noise.normal(0, 1, image.shape) for image in (vision, touch)]
+            vision, touch = (np.clip(image, 0, 255).astype(np.uint8) for image in changed)
         if fault == "constant" and item % 50 == 3:
             touch = np.full_like(touch, 7)
         if (fault == "bgr" and obj in (2, 5, 8)) or (fault == "half bgr" and obj % 2):
@@ -87,22 +83,24 @@ class Presses(Source):
             "sensor": "a" if obj // 3 % 2 else "b",
             "force": 1.0 + (obj * 7 + k * 5) % 11,
         }
-        if fault == "spelling" and obj == 2:
-            columns["group"] = "OBJECT\u00a003"  # in train, while "object 3" is in test
-        if fault == "labels" and item % 30 == 1:
-            columns["label_material"] = -1
-        if fault == "unseen class":
-            columns["label_material"] = 2 if held_out else obj // 4 % 2
-        if fault == "sensor":
-            columns["sensor"] = f"lab {material}"
-        if fault == "names of groups":  # 2022_000101 is a recording, though Python reads a number in it
-            day = material * 100 + obj
-            columns |= {"group": f"{day}", "touch_group": f"2022_{day:06d}", "take": f"{day}_0", "day": str(day)}
-        if fault == "written label":  # as its table wrote it: an empty cell is an unlabelled row, no number to repair
-            columns["material"] = "" if k == 9 else str(material)
-        if fault == "give-away":
-            columns["force"] = material + (obj * 7 + k * 5) % 11 / 10
-        return [Sample(vision=vision, touch=touch, columns=columns)]
+        day = material * 100 + obj
+        changes: dict[str, dict[str, Any]] = {
+            "spelling": {"group": "OBJECT\u00a003"} if obj == 2 else {},  # in train, while "object 3" is in test
+            "labels": {"label_material": -1} if item % 30 == 1 else {},
+            "unseen class": {"label_material": 2 if held_out else obj // 4 % 2},
+            "sensor": {"sensor": f"lab {material}"},
+            # 2022_000101 is a recording, though Python reads a number in it
+            "names of groups": {
+                "group": f"{day}",
+                "touch_group": f"2022_{day:06d}",
+                "take": f"{day}_0",
+                "day": str(day),
+            },
+            # as its table wrote it: an empty cell is an unlabelled row, no number to repair
+            "written label": {"material": "" if k == 9 else str(material)},
+            "give-away": {"force": material + (obj * 7 + k * 5) % 11 / 10},
+        }
+        return [Sample(vision=vision, touch=touch, columns=columns | changes.get(fault, {}))]
 
 
 def path_of(obj: int) -> np.ndarray:
@@ -358,11 +356,8 @@ def test_what_two_packs_share_is_a_finding(tmp_path: Path, capsys: pytest.Captur
     both = str(tmp_path / "one"), str(tmp_path / "other")
     assert main(["data", "check", *both, "--json", str(tmp_path / "found.json")]) == 2
     found = {f["item"]: f for f in json.loads((tmp_path / "found.json").read_text())["findings"]}
-    shared = found["shared by parts"]
-    assert (
-        shared["verdict"] == "broken"
-        and "is in train or val of part one and in test of part other" in shared["evidence"]
-    )
+    shared, says = found["shared by parts"], "is in train or val of part one and in test of part other"
+    assert shared["verdict"] == "broken" and says in shared["evidence"]
     assert found["groups across splits"]["verdict"] == "ok"
     assert main(["data", "info", *both]) == 0 and "is in train or val of part one" in capsys.readouterr().out
 
