@@ -127,7 +127,8 @@ def test_an_image_is_read_as_rgb(encoding: str) -> None:
     if encoding.endswith("a8"):
         pixels = np.dstack([pixels, np.full((4, 6), 9, np.uint8)])
     if encoding == "mono8":
-        image[..., 1:] = pixels = image[..., :1]
+        pixels = image[..., :1]
+        image[..., 1:] = pixels
     topic = load_node().Topic("/gel")
     topic.message = compressed(7.5, image) if encoding == "compressed" else raw(7.5, pixels, encoding)
     assert np.array_equal(topic.read(), image) and topic.captured == START + 7.5

@@ -162,7 +162,7 @@ def test_probe_scores_best_weights(pack: Pack, run: Path, smoke_run: Path, capsy
 
 
 def test_a_table_shows_each_evaluation(measured: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """While training: a column per task by both senses, R2 and accuracy told apart, within 80 columns; also of a run that is resumed."""
+    """A column per task by both senses, R2 and accuracy told apart, within 80 columns; also of a run that is resumed."""
     settings = smoke(measured, steps=4, eval_every=2, checkpoint_every=2)
     with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
         train(settings, tmp_path / "r")
