@@ -367,8 +367,7 @@ def test_a_full_disk_ends_the_recording_only(tmp_path: Path, monkeypatch: pytest
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
     said: list[str] = []
-    recorder = Recorder(tmp_path / "out", fps=1.0, tell=said.append)
-    image = np.zeros((16, 16, 3), np.uint8)
+    recorder, image = Recorder(tmp_path / "out", fps=1.0, tell=said.append), np.zeros((16, 16, 3), np.uint8)
     for i in range(200):
         if i == 100:
             monkeypatch.setattr("mvitac.live.recorder.write_atomic", full)

@@ -32,8 +32,7 @@ def engine(onnx: Path) -> Engine:
 @pytest.fixture(scope="module")
 def films(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """50 frames of touch at 25 a second, 20 without contact, and 24 of vision at 12."""
-    folder = tmp_path_factory.mktemp("films")
-    noise = np.random.default_rng(0).integers(0, 4, (NUM, 120, 160, 3))
+    folder, noise = tmp_path_factory.mktemp("films"), np.random.default_rng(0).integers(0, 4, (NUM, 120, 160, 3))
 
     def touch(number: int) -> np.ndarray:
         image = np.full((120, 160, 3), 100) + noise[number]

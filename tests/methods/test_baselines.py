@@ -73,11 +73,9 @@ def test_cmc_equals_a_direct_transcription(softmax: bool) -> None:
     fixed: dict[str, float] = {}
     for seed in (5, 6):
         batch = views(method, seed=seed)
-        banks = {m: bank.values.clone() for m, bank in method.banks.items()}
-        found = outcome(method, batch)
+        banks, found = {m: bank.values.clone() for m, bank in method.banks.items()}, outcome(method, batch)
         torch.manual_seed(9)
-        at = [ROWS.tolist().index(row) for row in batch.rows.tolist()]
-        drawn = torch.randint(len(ROWS), (8, 10))
+        at, drawn = [ROWS.tolist().index(row) for row in batch.rows.tolist()], torch.randint(len(ROWS), (8, 10))
         drawn[:, 0] = torch.tensor(at)
         z, total = {m: unit(tower(batch.images[m][0])) for m, tower in method.towers.items()}, 0.0
         for name, query, bank in (("vt", "vision", "touch"), ("tv", "touch", "vision")):
@@ -133,8 +131,7 @@ def test_moco_contrasts_with_the_queue_then_fills_it() -> None:
     assert isinstance(method, MoCo)
     batch = views(method)
     keys = {m: method.key[m](batch.images[m][1]) for m in batch.images}
-    queues = {m: queue.keys.clone() for m, queue in method.queues.items()}
-    found = outcome(method, batch)
+    queues, found = {m: queue.keys.clone() for m, queue in method.queues.items()}, outcome(method, batch)
     for modality in ("vision", "touch"):
         q = method.towers[modality](batch.images[modality][0])
         torch.testing.assert_close(found[modality], queue_nce(q, keys[modality], queues[modality], 0.2))

@@ -30,8 +30,7 @@ def test_equals_the_paper_written_out() -> None:
         for p in method.key.parameters():
             p.add_(0.05 * torch.randn_like(p))
     theta, psi = copy.deepcopy(method.query["vision"]), copy.deepcopy(method.query["touch"])
-    theta_k = copy.deepcopy(method.key["vision"].module)
-    psi_k = copy.deepcopy(method.key["touch"].module)
+    theta_k, psi_k = copy.deepcopy(method.key["vision"].module), copy.deepcopy(method.key["touch"].module)
     phi_v_q, phi_t_q, Phi_t_q, Phi_v_q = theta.intra, theta.inter, psi.intra, psi.inter
     phi_v_k, phi_t_k, Phi_t_k, Phi_v_k = theta_k.intra, theta_k.inter, psi_k.intra, psi_k.inter
     (o_v_q, o_v_k), (o_t_q, o_t_k) = batch.images["vision"], batch.images["touch"]

@@ -93,8 +93,7 @@ def products(trunk: nn.Module, images: torch.Tensor) -> int:
 
 
 def test_only_small_maps_in_training_take_the_product() -> None:
-    trunk = build_trunk(EncoderConfig(trunk="resnet10t", weights=SCRATCH), 3)
-    images = torch.randn(2, 3, 48, 48)
+    trunk, images = build_trunk(EncoderConfig(trunk="resnet10t", weights=SCRATCH), 3), torch.randn(2, 3, 48, 48)
     # Stages 3 (3x3 pixels) and 4 (2x2) have two 3x3 convolutions each; larger maps stay with the convolution.
     assert products(trunk.train(), images) == 4 and products(trunk.train(), torch.randn(2, 3, 160, 160)) == 0
     assert products(trunk.eval(), images) == 0

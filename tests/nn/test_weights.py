@@ -52,8 +52,7 @@ def test_an_installed_package_has_imagenet_weights() -> None:
     for (name, value), kept in zip(trunk.state_dict().items(), given.values(), strict=False):
         assert torch.equal(value, kept), name
     assert EncoderConfig(trunk=LITE).mean_std == ((0.5,) * 3, (0.5,) * 3) and "state_dict" not in trunk.pretrained_cfg  # type: ignore[operator]
-    six = build_trunk(EncoderConfig(trunk=f"{LITE}.in1k"), 6).eval()
-    image = torch.randn(2, 3, 64, 64)
+    six, image = build_trunk(EncoderConfig(trunk=f"{LITE}.in1k"), 6).eval(), torch.randn(2, 3, 64, 64)
     torch.testing.assert_close(six(torch.cat([image, image], 1)), trunk.eval()(image), atol=1e-3, rtol=1e-3)
 
 

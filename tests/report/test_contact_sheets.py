@@ -43,8 +43,7 @@ def places(picture: np.ndarray, image: np.ndarray) -> list[tuple[int, int]]:
 def test_pixels_lie_where_they_should(tmp_path: Path, touch_channels: int) -> None:
     pack = build(Toy(touch_channels=touch_channels), tmp_path / "p", size=32, quiet=True)
     found = contact_sheet.samples(pack)
-    picture = np.asarray(contact_sheet.draw("toy", found))
-    tops = []
+    picture, tops = np.asarray(contact_sheet.draw("toy", found)), []
     for _, tiles in found:
         for image, row in zip((image for image, _ in tiles), rows_of(pack, tiles), strict=True):
             assert np.array_equal(image, pair(pack, row, 96))

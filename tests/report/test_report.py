@@ -291,14 +291,9 @@ def test_only_a_complete_result_of_the_same_weights_is_used_again(
     assert stored_result(runs, pack) == result
     assert stored_result(runs[::-1], pack) == result and stored_result(runs[:1], pack) is None
     asked = result["asked"]
-    for change in (
-        {"asked": {**asked, "controls": False}},
-        {"asked": {**asked, "tasks": ["soft"]}},
-        {"asked": {**asked, "probes": ["knn"]}},
-        {"models": ["0" * 64, result["models"][0]]},
-        {"pack": "0" * 64},
-        {"records": "damaged"},
-    ):
+    others: list[dict[str, Any]] = [{"controls": False}, {"tasks": ["soft"]}, {"probes": ["knn"]}]
+    changes = [{"models": ["0" * 64, result["models"][0]]}, {"pack": "0" * 64}, {"records": "damaged"}]
+    for change in (*({"asked": {**asked, **other}} for other in others), *changes):
         write_json(file, {**result, **change})
         assert stored_result(runs, pack) is None
     write_json(file, result, sealed=True)

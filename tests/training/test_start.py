@@ -114,8 +114,7 @@ def test_trunks_of_windows_and_of_single_images_take_each_other() -> None:
 
 
 def test_digest_is_that_of_the_content(pack: Pack, smoke_run: Path, artifact: Path, tmp_path: Path) -> None:
-    copied = shutil.copy(smoke_run / "model.safetensors", tmp_path / "copy.safetensors")
-    without = smoke(pack)
+    copied, without = shutil.copy(smoke_run / "model.safetensors", tmp_path / "copy.safetensors"), smoke(pack)
     digests = {smoke(pack, init=Init(path=Path(p))).digest() for p in (smoke_run, artifact, copied)}
     assert len(digests) == 1 and without.digest() not in digests
     assert smoke(pack, init=Init(path=smoke_run, heads=False)).digest() not in digests

@@ -33,8 +33,7 @@ def run(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_start_is_evaluated_first(pack: Pack, run: Path) -> None:
-    settings = mvitac.load(run).run
-    evaluations = [entry for entry in log_of(run) if "eval" in entry]
+    settings, evaluations = mvitac.load(run).run, [entry for entry in log_of(run) if "eval" in entry]
     assert [entry["step"] for entry in evaluations] == [0, 2, 4, 6, 8]
     assert evaluations[0]["eval"] == validate(fresh(settings, pack.spec, pack.size), pack, settings)[0]
     assert set(LINEAR) < evaluations[0]["eval"].keys()
@@ -101,8 +100,7 @@ def test_what_rose_and_what_fell_is_told_by_a_paired_t_interval_over_groups() ->
     changes = {"a": [-3, -3, -4, -3, -3, -2, -3, -3, -4, -2], "b": [0, 0, -1, 0, 1, 0, 1, 0, 0, 0], "c": [2] * 9 + [3]}
     wrong = {name: np.array(before) + change for name, change in changes.items()}
     start: Cells = {f"touch/linear {name}": cell(before) for name in changes}
-    said = verdict(start, {f"touch/linear {name}": cell(list(w)) for name, w in wrong.items()}, "object")
-    texts = {}
+    said, texts = verdict(start, {f"touch/linear {name}": cell(list(w)) for name, w in wrong.items()}, "object"), {}
     for name, w in wrong.items():
         rates = 1 - w / 10, 1 - np.array(before) / 10
         low, high = ttest_rel(*rates).confidence_interval(0.95)

@@ -86,9 +86,8 @@ class MoCo(Contrastive):
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         assert self.queues, "call prepare(rows) first"
         self.pending = {m: z["k", m] for m in self.towers if ("k", m) in z}
-        tau = self.config.temperature
         queue: dict[str, Tensor] = {m: queue.keys for m, queue in self.queues.items()}  # type: ignore[misc]
-        return with_sum({m: queue_nce(z["q", m], z["k", m], queue[m], tau) for m in self.pending})
+        return with_sum({m: queue_nce(z["q", m], z["k", m], queue[m], self.config.temperature) for m in self.pending})
 
     def after_step(self, progress: float) -> None:
         for modality, keys in self.pending.items():

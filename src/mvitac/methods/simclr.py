@@ -43,8 +43,7 @@ def nt_xent(a: Float[Tensor, "B D"], b: Float[Tensor, "B D"], temperature: float
         z = F.normalize(torch.cat([a, b]).float(), dim=1)
         logits = z @ z.T / temperature
         logits = logits.masked_fill(torch.eye(len(z), dtype=torch.bool, device=z.device), float("-inf"))
-        num = len(a)
-        return F.cross_entropy(logits, torch.arange(2 * num, device=z.device).roll(num))
+        return F.cross_entropy(logits, torch.arange(len(z), device=z.device).roll(len(a)))
 
 
 class SimCLR(Contrastive):

@@ -102,9 +102,8 @@ class LinearProbe(nn.Module):
         if not all(tensor.dtype == torch.float32 and tensor.isfinite().all() for tensor in tensors):
             raise ValueError(f"probe {info.name}: its weights are not all finite float32")
         self.info = info
-        self.register_buffer("weight", weight)
-        self.register_buffer("bias", bias)
-        self.register_buffer("bounds", bounds)
+        for name, tensor in (("weight", weight), ("bias", bias), ("bounds", bounds)):
+            self.register_buffer(name, tensor)
 
     def forward(self, features: Tensor) -> Tensor:
         """Probabilities [B, K] or values [B, T] of ``features`` [B, D]."""

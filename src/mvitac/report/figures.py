@@ -65,11 +65,10 @@ def bars(
             top = max(top, cell["high"])
         y += 1.25
     axes.set_yticks(list(ticks), list(ticks.values()), color=COLOURS["ink"])
-    axes.set_ylim(y - 0.6, -0.7)
-    axes.set_xlim(100 * least, max(1.0, 100 * (top + 0.15 * (top - least))))
+    right = max(1.0, 100 * (top + 0.15 * (top - least)))
+    axes.set(xlim=(100 * least, right), ylim=(y - 0.6, -0.7), xlabel=what)
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.grid(axis="x")
-    axes.set_xlabel(what)
     axes.spines["left"].set_visible(False)
     labels, handles = [], []
     for number, (name, value) in enumerate(lines.items()):
@@ -130,8 +129,7 @@ def curves(title: str, lines: Sequence[Line], references: Mapping[str, float] | 
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.ticklabel_format(axis="y", useOffset=False)
     axes.margins(y=0.12)
-    axes.set_xlim(0, 1.04 * max(max(line.x) for line in lines))
-    axes.set_xlabel("step")
+    axes.set(xlim=(0, 1.04 * max(max(line.x) for line in lines)), xlabel="step")
     labels = [shorten(label, 30) for label in handles]
     figure.legend(list(handles.values()), labels, loc=BELOW, ncols=2 if max(map(len, labels)) > 18 else 3)
     return figure

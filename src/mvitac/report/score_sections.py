@@ -21,8 +21,7 @@ def probe(study: Study) -> list[Markup]:
     kinds: list[str] = list(dict.fromkeys(r["probe"] for r in records))  # the first one is that of the summary
     drawn = []
     for task, found in summary.items():
-        order = sources_of(found)
-        groups = {m: {s: found[m][s] for s in order if s in found[m]} for m in columns_of(found)}
+        groups = {m: {s: found[m][s] for s in sources_of(found) if s in found[m]} for m in columns_of(found)}
         lines = {name: cell["mean"] for name, cell in found.get("none", {}).items()}
         drawing = figures.bars(task, groups, lines, f"{score_name(found)} %, mean and 95 % interval")
         alt = f"Probe scores on {task}; the numbers are in the table below"

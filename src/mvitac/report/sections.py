@@ -144,9 +144,8 @@ def collapse(study: Study) -> list[Markup]:
             drawn.append(study.figure(title, drawing, f"{title} over the steps. {caption}", caption))
     if not drawn:
         return []
-    where = f"{study.pack.spec.group_by}s held out for this (split val)"
-    if len(study.pack.rows("val")) < 2:
-        where = "training rows (no val split)"
+    held_out = f"{study.pack.spec.group_by}s held out for this (split val)"
+    where = held_out if len(study.pack.rows("val")) > 1 else "training rows (no val split)"
     said = [f"{r.source}, seed {r.run.seed}: {e['verdict']}." for r in study.runs for e in r.log if "verdict" in e]
     intro = f"Measured while training, on {where}. Dashed: the value at the start, before the first step."
     return [html.paragraph(intro), *map(html.paragraph, said), html.grid(drawn)]

@@ -269,8 +269,7 @@ def test_the_lag_is_touch_after_vision(late: int, tmp_path: Path) -> None:
     def flash(_: Sample, item: int) -> dict[str, np.ndarray]:
         obj, k = divmod(item, NUM_FRAMES)
         jumps = np.random.default_rng(obj).choice([1, 12], NUM_FRAMES + 20)
-        level = 128 + np.cumsum(jumps * np.resize([1, -1], len(jumps)))
-        shifts = {"vision": 0, "touch": late}
+        level, shifts = 128 + np.cumsum(jumps * np.resize([1, -1], len(jumps))), {"vision": 0, "touch": late}
         return {m: np.full((SIDE, SIDE, 3), level[10 + k - shift], np.uint8) for m, shift in shifts.items()}
 
     pack = build(altered(Presses(), flash), tmp_path / "p", size=SIDE, quiet=True)

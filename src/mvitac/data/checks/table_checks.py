@@ -91,8 +91,8 @@ def leaks(pack: Pack) -> list[Finding]:
                 kind = f" ({pack.spec.group_by})" if name == "group" else ""
                 test = on.get("test", set())
                 of = f"; {len(test & on.get('train', set()))} of {len(test)} in test are also in train" if test else ""
-                num = len(set(values))
-                notes[name] = f"{name}{kind}: {len(both)} of {num} in more than one split, e.g. {both[0]!r}{of}"
+                num = f"{len(both)} of {len(set(values))}"
+                notes[name] = f"{name}{kind}: {num} in more than one split, e.g. {both[0]!r}{of}"
                 for one in both[:4]:  # a row of each split, side by side on the sheet
                     mine = np.flatnonzero(values == one)
                     rows += [int(there[mine[sides[mine] == side][0]]) for side in np.unique(sides[mine])]
