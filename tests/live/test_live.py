@@ -223,12 +223,8 @@ def test_sources_by_name(tmp_path: Path) -> None:
         frame = stream.newest()
         seen.append(frame.image[0, 0, 0] if frame else None)
     assert seen == [0, 0, 20, 20] and stream.num_damaged == 1 and isinstance(source("sim:3", "vision"), Simulated)
-    for text, says in (
-        ("nothing", "'nothing': give a video"),
-        ("sim:-3", "'-3' is no seed"),
-        (f"{tmp_path}@fast", "'fast' is no"),
-        ("0#0:0:-5:9", "give the part as"),
-    ):
+    wrong = {"nothing": "'nothing': give a video", "sim:-3": "'-3' is no seed", "0#0:0:-5:9": "give the part as"}
+    for text, says in (wrong | {f"{tmp_path}@fast": "'fast' is no"}).items():
         with pytest.raises(ValueError, match=says):
             source(text, "touch")
     missing = Stream("touch", source("97", "touch"), clock=Clock())
@@ -247,7 +243,6 @@ def test_a_video_is_read_to_its_end_without_opencv(monkeypatch: pytest.MonkeyPat
     with pytest.raises(Ended):
         file.read()
     file.close()
-
     file.open()
     file.next = None
     with pytest.raises(ValueError, match="cannot be decoded"):  # skipped, unlike a lost camera

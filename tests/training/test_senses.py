@@ -52,7 +52,6 @@ def test_from_training_to_the_exported_model(pack: Pack, file: Path, tmp_path: P
     run = started(pack, file)
     trained, start = weights(train_twice(run, tmp_path, cut=3)), build_trunk(run.encoder.vision, 3).state_dict()
     assert not any(torch.equal(trained[f"encoders.vision.{name}"], value) for name, value in start.items())
-
     model = mvitac.load(tmp_path / "cut")
     assert "vision test_resnet.r160_in1k, touch mvitac_tiny" in repr(model)
     images = {m: pack.images[m][:5].copy() for m in ("vision", "touch")}
@@ -65,7 +64,6 @@ def test_from_training_to_the_exported_model(pack: Pack, file: Path, tmp_path: P
         model.embed(vision=images["vision"][0])["vision"],
         model.encoders["vision"](torch.from_numpy(pixels).float().permute(0, 3, 1, 2)).detach(),
     )
-
     scores = probe_runs([tmp_path / "cut"], ProbeConfig(probes=("linear",)), pack)["records"]
     assert {r["modality"] for r in scores if r.get("source") == "mvitac"} == {"vision", "touch", "both"}
     assert {r["modality"] for r in scores if r["source"] == "start"} == {"vision"}  # touch starts from random weights

@@ -40,15 +40,9 @@ class Presses(Source):
     fault: str = ""
 
     def spec(self) -> DataSpec:
-        return DataSpec(
-            name="presses",
-            vision_channels=3,
-            touch_channels=3,
-            tasks=(Task(name="material", classes=("wood", "metal", "cloth")),),
-            group_by="object",
-            licence="none",
-            source="tests/data/checks/test_checks.py",
-        )
+        about: Any = {"group_by": "object", "licence": "none", "source": "tests/data/checks/test_checks.py"}
+        tasks = (Task(name="material", classes=("wood", "metal", "cloth")),)
+        return DataSpec(name="presses", vision_channels=3, touch_channels=3, tasks=tasks, **about)
 
     def items(self) -> list[str]:
         return [f"object {obj} frame {k}" for obj in range(NUM_OBJECTS) for k in range(NUM_FRAMES)]
@@ -84,18 +78,14 @@ class Presses(Source):
             "force": 1.0 + (obj * 7 + k * 5) % 11,
         }
         day = material * 100 + obj
+        names = {"group": f"{day}", "touch_group": f"2022_{day:06d}", "take": f"{day}_0", "day": str(day)}
         changes: dict[str, dict[str, Any]] = {
             "spelling": {"group": "OBJECT\u00a003"} if obj == 2 else {},  # in train, while "object 3" is in test
             "labels": {"label_material": -1} if item % 30 == 1 else {},
             "unseen class": {"label_material": 2 if held_out else obj // 4 % 2},
             "sensor": {"sensor": f"lab {material}"},
             # 2022_000101 is a recording, though Python reads a number in it
-            "names of groups": {
-                "group": f"{day}",
-                "touch_group": f"2022_{day:06d}",
-                "take": f"{day}_0",
-                "day": str(day),
-            },
+            "names of groups": names,
             # as its table wrote it: an empty cell is an unlabelled row, no number to repair
             "written label": {"material": "" if k == 9 else str(material)},
             "give-away": {"force": material + (obj * 7 + k * 5) % 11 / 10},

@@ -28,16 +28,9 @@ class Recordings(Source):
     def spec(self) -> DataSpec:
         force = ValueTask(name="force", targets=(Target(name="force_n", unit="N"),))
         tilt = ValueTask(name="pose", targets=(Target(name="tilt", unit="rad"),))
-        return DataSpec(
-            name="recordings",
-            vision_channels=0,
-            touch_channels=3,
-            tasks=(),
-            values=(force, tilt),
-            group_by="object",
-            licence="none",
-            source="tests/data/checks/test_value_checks.py",
-        )
+        about: Any = {"group_by": "object", "licence": "none", "source": "tests/data/checks/test_value_checks.py"}
+        channels: Any = {"vision_channels": 0, "touch_channels": 3}
+        return DataSpec(name="recordings", tasks=(), values=(force, tilt), **channels, **about)
 
     def items(self) -> list[str]:
         return [f"{k} {i}" for k in range(NUM) for i in range(LENGTH)]
