@@ -28,8 +28,15 @@ from tyro.conf import Fixed
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, row_pairs
-from mvitac.nn import encoders
-from mvitac.nn.encoders import EncoderConfig, Encoders, Head, build_trunk, features_of, num_features
+from mvitac.nn.encoders import (
+    EncoderConfig,
+    Encoders,
+    Head,
+    build_trunk,
+    draws_random_numbers,
+    features_of,
+    num_features,
+)
 from mvitac.nn.losses import info_nce
 from mvitac.nn.momentum import Momentum
 from mvitac.system.threads import in_branches
@@ -218,6 +225,6 @@ def embed(name: str, towers: nn.ModuleDict, batch: Views, views: slice) -> Embed
         return {(name, modality, i, head): z for (i, _), pair in pairs for head, z in zip(HEADS, pair, strict=True)}
 
     branches = [partial(of, modality) for modality, _ in present(towers, batch)]
-    if locked or any(x.device.type != "cpu" for x in first) or encoders.draws_random_numbers(towers):
+    if locked or any(x.device.type != "cpu" for x in first) or draws_random_numbers(towers):
         return {key: tensor for branch in branches for key, tensor in branch().items()}
     return in_branches(branches)
