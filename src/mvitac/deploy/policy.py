@@ -23,7 +23,8 @@ STATE = "observation.state"
 class ObservationEncoder(nn.Module):
     """Features [B, D] (or [B, T, D]) of an observation, in the order of ``keys``, with the robot's state at the end.
 
-    A model of difference images (``model.spec.difference``) takes touch as (touch - background) / 2 + one half.
+    A model of difference images (``model.spec.difference``) takes touch as (touch - background) / 2 + one half. Images of
+    another kind are refused; on a GPU, those of other values only in the first batch of a key.
     """
 
     def __init__(self, model: Model, keys: Mapping[str, str], *, state: int = 0, tune: bool = False) -> None:
