@@ -176,6 +176,13 @@ def test_lerobot_says_what_is_missing(tmp_path: Path) -> None:
     for place in (f"{tmp_path}/old/videos/", "../old/videos/"):
         file.write_text(about.replace('"videos/', f'"{place}'))
         refused(root, "video_path leads out of the dataset, to ")
+    for field in ("{video_key:>2000000000}", "{video_key.__class__}", "{video_key!r:>9}"):
+        file.write_text(about.replace("{video_key}", field))
+        refused(root, r"video_path is .*, not of fields such as \{file_index:03d\}")
+    file.write_text(about)
+    for size in (0, '"x"'):
+        file.write_text(about.replace("{", f'{{"chunks_size": {size}, ', 1))
+        refused(root, "(ZeroDivision|Type)Error")
     file.write_text(about)
     (root / f"videos/{GEL}/chunk-000/file-001.mp4").unlink()
     refused(root, r"file-001\.mp4 is missing: fetch the videos too")

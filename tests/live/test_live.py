@@ -6,6 +6,8 @@ import os
 import re
 import shutil
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -386,6 +388,18 @@ def test_a_recording_survives_a_crash(tmp_path: Path) -> None:
     exec(re.search('"(.*)"', str(refused.value))[1])  # type: ignore[index]
     pack = Pack(out)
     assert pack.num == 128 and np.array_equal(pack.images["touch"][:, 0, 0, 0], pack.column("time").astype(float))
+
+
+def test_a_running_recording_is_not_finished_by_another(tmp_path: Path) -> None:
+    """Nor is a folder taken for a spool that holds anything else."""
+    recorder = Recorder(tmp_path / "out")
+    code = f"from mvitac.live.recorder import finish; finish({str(tmp_path / 'out')!r})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "out is still being recorded: stop that first" in done.stderr and recorder.spool.exists()
+    (recorder.spool / "thesis.tex").touch()
+    with pytest.raises(ValueError, match=r"thesis\.tex is of no recording: take it out of there"):
+        recorder.close()
+    assert (recorder.spool / "thesis.tex").exists()
 
 
 def test_a_recording_that_nothing_came_of_is_not_in_the_way(tmp_path: Path) -> None:

@@ -80,11 +80,12 @@ def test_a_probe_that_values_lack_does_not_hide_them(scored: tuple[Path, Pack, d
 def test_targets_have_scores_of_their_own(scored: tuple[Path, Pack, dict[str, Any]]) -> None:
     *_, result = scored
     cell = summarise(result["records"], "linear")["both"]["touch"]["pixels"]
-    (record,) = (r for r in result["records"] if (r["task"], r["source"], r["modality"]) == ("both", "pixels", "touch"))
+    names, wanted = ("task", "source", "modality", "probe"), ("both", "pixels", "touch", "linear")
+    (record,) = (r for r in result["records"] if tuple(r[name] for name in names) == wanted)
     assert cell["mean"] == pytest.approx(np.mean([target["mean"] for target in cell["targets"]]))
     for found, target in zip(cell["targets"], record["targets"], strict=True):
-        wanted = target["r2"], target["mae"], target["rmse"]
-        assert (found["mean"], found["mae"], found["rmse"]) == pytest.approx(wanted)
+        scores = target["r2"], target["mae"], target["rmse"]
+        assert (found["mean"], found["mae"], found["rmse"]) == pytest.approx(scores)
         assert found["low"] < found["mean"] < found["high"]
 
 
@@ -136,7 +137,7 @@ def test_tables_of_a_comparison_have_a_table_of_targets(scored: tuple[Path, Pack
     assert (found["task"], found["score"], found["unit"]) == ("both", "R2", "N")
     assert float(found["mae"]) == cell["mae"] and float(found["accuracy"]) == cell["mean"]
     keys = [(r["row"], r["probe"], r["modality"], r["task"], r["target"]) for r in rows]
-    assert len(keys) == len(set(keys)) and {r["probe"] for r in rows if r["row"] == "pixels"} == {"linear"}
+    assert len(keys) == len(set(keys)) and {r["probe"] for r in rows if r["row"] == "pixels"} == {"linear", "knn"}
 
 
 def test_figures_cut_off_what_no_axis_can_show() -> None:

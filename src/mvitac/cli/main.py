@@ -42,7 +42,8 @@ COMMANDS = {
 
 OWN = (
     *(".safetensors", ".npy", ".onnx", ".pt", "samples.parquet", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"),
-    *("run.json", "pack.json", "export.json", "artifact.json"),
+    *("run.json", "pack.json", "export.json", "artifact.json", "metadata.yaml"),
+    *(".mcap", ".db3", ".mp4", ".h5", ".hdf5"),
 )
 HEAVY = ("demo", "pretrain", "finetune", "compare", "bench")
 """Commands whose options need torch. The others import it once their options are known to be right."""
@@ -132,7 +133,7 @@ def _check_choices(rest: Sequence[str], text: Path) -> None:
 
 
 def _check_outputs(words: Sequence[str]) -> None:
-    """ValueError for an output that is an input, or a file with a name of ``OWN`` in a folder that is one."""
+    """ValueError for an output that is an input, or a file with a name of ``OWN`` in its folder or that of a table."""
     places = [part for word in words for part in word.split("=")]
     for at, (option, out) in enumerate(itertools.pairwise(places)):
         if option in ("--out", "--json", "--sheet") and os.path.isfile(out):
@@ -141,8 +142,10 @@ def _check_outputs(words: Sequence[str]) -> None:
                 part for each in others for part in (re.sub(r"(@[\d.]+)?(#.*)?$", "", each), *re.split("[,:]", each))
             ]
             inputs = [place for place in parts if os.path.exists(place)]
-            own = {os.path.realpath(place) for place in inputs if out.lower().endswith(OWN)}
-            inside = own & {os.fspath(folder) for folder in Path(out).resolve().parents}
+            file = Path(out).resolve()
+            folders = [os.path.dirname(p) if p.endswith((".csv", ".jsonl", ".parquet")) else p for p in inputs]
+            own = {os.path.realpath(folder) for folder in folders if file.name.lower().endswith(OWN)}
+            inside = own & {os.fspath(folder) for folder in file.parents}
             if inside or any(os.path.samefile(out, place) for place in inputs):
                 raise ValueError(f"{option} {out} would overwrite what the command reads: choose another file")
 

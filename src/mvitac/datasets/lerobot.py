@@ -114,8 +114,10 @@ class LeRobotConfig(RecordedConfig):
                 raise ValueError(f"{self.path}: meta/episodes has no entry for {key} in episode {name}")
             where = f"{self.path}: meta/info.json or meta/episodes, {key} in episode {name},"
             place = {part: episode.get(f"videos/{key}/{part}") for part in ("chunk_index", "file_index")}
-            place |= {"episode_index": number, "episode_chunk": number // info.get("chunks_size", 1000)}
             with fields_of(where):
+                place |= {"episode_index": number, "episode_chunk": number // info.get("chunks_size", 1000)}
+                if re.search(r"[{}]", re.sub(r"\{\w+(:0?\d?d)?\}", "", info["video_path"])):  # a width can fill memory
+                    raise ValueError(f"video_path is {info['video_path']}, not of fields such as {{file_index:03d}}")
                 file = self.path / info["video_path"].format(video_key=key, **place)
                 if not Path(os.path.normpath(file)).is_relative_to(os.path.normpath(self.path)):
                     raise ValueError(f"video_path leads out of the dataset, to {file}")
@@ -225,7 +227,10 @@ def _tasks(root: Path, info: dict[str, Any]) -> dict[str, str]:
 def _rows(path: Path, begins: tuple[str, ...] = ("",)) -> list[dict[str, Any]]:
     """Return the rows of a .jsonl file, if there is one, or of parquet, of columns whose name ``begins`` so."""
     if path.suffix == ".jsonl":
-        return [*map(parse_json, path.read_text().splitlines())] if path.is_file() else []
+        try:
+            return [*map(parse_json, path.read_text().splitlines())] if path.is_file() else []
+        except ValueError as error:
+            raise ValueError(f"{path} cannot be read ({brief(error)}): fetch it again") from None
     try:
         table = pq.read_table(path)
     except (pa.ArrowException, OSError) as error:

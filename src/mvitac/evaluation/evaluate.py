@@ -99,9 +99,7 @@ def probe_runs(
     sources = check_unseen(paths, pack, tasks, weights, allow_leak=allow_leak or bool(session.folds))
     score = partial(_score, [*zip(paths, models, names, sources, strict=True)], runs, modalities, session)
     if session.folds:
-        records, unlearned = _in_folds(score, pack, others, tasks, session.folds, sources)
-        tested = [f"{session.folds} folds: every {pack.spec.group_by} that no run learned from is tested once"]
-        tested, retrieval = tested + unlearned, []
+        (records, tested), retrieval = _in_folds(score, pack, others, tasks, session.folds, sources), []
     else:
         (records, retrieval), tested = score(pack, others, tasks), _unlearned([(t, [pack]) for t in tasks])
     leaks = [*leaks_of(every := [*records, *retrieval]), *([] if session.folds else mark_split_leaks(pack, every))]
@@ -177,7 +175,7 @@ def _in_folds(
     num: int,
     sources: Sequence[list[Source] | None],
 ) -> tuple[Records, list[str]]:
-    """Probe records of all folds, pooled, and ``_unlearned``. There is no retrieval: too few groups to search in."""
+    """Probe records of all folds, pooled, and notes on them. There is no retrieval: too few groups to search in."""
     learned = [source for several in sources for source in several or ()]
     splits = [(task, [{task.split: s.tolist()} for s in fold_splits(pack, task, num, learned)]) for task in tasks]
     folds: list[Records] = []
@@ -186,7 +184,8 @@ def _in_folds(
         for task, cells in splits:
             own = [(model, data.with_splits(cells[k])) for model, data in others]
             folds[k] += score(pack.with_splits(cells[k]), own, [task])[0]
-    return pool(folds), _unlearned([(task, map(pack.with_splits, cells)) for task, cells in splits])
+    tested = f"{num} folds: every {pack.spec.group_by} that no run learned from is tested once"
+    return pool(folds), [tested, *_unlearned([(task, map(pack.with_splits, cells)) for task, cells in splits])]
 
 
 def as_trained(model: Model, pack: Pack) -> Pack:

@@ -6,6 +6,7 @@ After a crash the spool stays, and ``finish`` makes the pack.
 import io
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from mvitac.data.build import build
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec
 from mvitac.system.files import brief, check_place, digest_file, write_atomic
+from mvitac.system.locks import hold_lock
 
 SPOOL = 64  # pairs per file of the spool: the number that a crash can lose
 
@@ -34,6 +36,8 @@ class Recorder:
         if self.spool.exists():
             still = "is of a recording that still runs, or crashed and is finished by"
             raise ValueError(f"{self.spool} {still} {_command(out)}")
+        self.held = ExitStack()
+        self.held.enter_context(hold_lock(out, f"{out} is being recorded", wait=False))
         self.spool.mkdir(parents=True)
         self.waiting: list[tuple[dict[str, np.ndarray], dict[str, Any]]] = []
         self.num, self._next = 0, float("-inf")
@@ -74,7 +78,8 @@ class Recorder:
         """Write the last pairs and make the pack; returns its number of pairs (0: none). ValueError: they stay."""
         self._flush()
         try:
-            return finish(self.out)
+            with self.held:
+                return finish(self.out)
         except (OSError, ValueError) as error:
             kept = f"{self.num} pairs are kept in {self.spool}, make room and finish them by"
             raise ValueError(f"{brief(error)}: {kept} {_command(self.out)}") from None
@@ -89,11 +94,17 @@ def _spool(out: Path) -> Path:
 
 
 def finish(out: str | Path) -> int:
-    """Make ``out`` from its spool, which is then deleted; returns its number of pairs (0: nothing is made)."""
+    """Make ``out`` from its spool, which is then deleted; returns its number of pairs (0: nothing is made).
+
+    Busy if it is still being recorded; ValueError if other files are in the spool.
+    """
     spool, num = Recorded(_spool(Path(out))), 0
-    if spool.files:  # none after a crash before the first
-        num = build(spool, Path(out), size=next(reversed(spool.shapes.values()))[0], quiet=True).num
-    shutil.rmtree(spool.path)
+    with hold_lock(Path(out), f"{out} is still being recorded: stop that first", wait=False):
+        if others := {path for path in spool.path.iterdir() if path.suffix != ".tmp"} - {*spool.files}:
+            raise ValueError(f"{min(others)} is of no recording: take it out of there")
+        if spool.files:  # none after a crash before the first
+            num = build(spool, Path(out), size=next(reversed(spool.shapes.values()))[0], quiet=True).num
+        shutil.rmtree(spool.path)
     return num
 
 

@@ -70,7 +70,7 @@ def check_ordinary(path: Path) -> None:
 
 def check_place(path: Path) -> None:
     """Raise ValueError if ``path`` cannot be written. Call it before the work whose result is written there."""
-    parent = next(p for p in path.absolute().parents if os.path.lexists(p))
+    parent = next((p for p in path.absolute().parents if os.path.lexists(p)), path)
     try:
         check_ordinary(path)  # raises OSError if the name is too long
         with tempfile.TemporaryFile(dir=parent):
@@ -100,6 +100,7 @@ def write_json(path: Path, value: Any, *, sealed: bool = False) -> None:
 def read_json(path: Path, what: str) -> Any:
     """Read a JSON file; ValueError says if it is missing, damaged, or changed since it was sealed. ``what`` describes it."""
     try:
+        check_ordinary(path)  # a pipe never ends
         value = parse_json(path.read_text())
     except FileNotFoundError:
         raise ValueError(f"{path} does not exist: {what} is missing there") from None
