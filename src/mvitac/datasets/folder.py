@@ -57,6 +57,8 @@ class FolderConfig(RecordedConfig):
         if tables:
             return read_manifest(tables[0])
         if arrays := [file for file in files if file.name.lower().endswith(ARRAYS)]:
+            if (self.every or 1) > 1:
+                raise ValueError(f"{arrays[0]}: --data.every is not for HDF5 and zarr, whose rows are all used")
             images = [name for name in (self.vision, *self.touch, *self.background) if name]
             return read_arrays(self.path, arrays, images, self.vectors())
         cameras = [name for name in (*self.touch, self.vision) if name]

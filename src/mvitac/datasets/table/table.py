@@ -177,7 +177,7 @@ class RecordedConfig(RowsConfig, ABC):
 
     every: int | None = None
     """Use every n-th frame of a recording; by default all images, every row of an episode, and every fifth frame of a
-    video or image of a bag. Rows of a table are all used."""
+    video or image of a bag. Rows of a table, HDF5 or zarr are all used."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
