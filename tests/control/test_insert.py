@@ -120,7 +120,7 @@ def test_a_result_that_no_episodes_give_is_refused(small: Insert) -> None:
     one = np.ones(3)
     good = np.array([[1.0, 1.0, 0.0], [0.4, 1.0, 9.0], [0.1, 3.0, 2.0]])
     assert not small.impossible("both", one, good)
-    for place, value in (((0, 0), 0.5), ((1, 0), 1.5), ((2, 1), 3.1), ((1, 2), -1.0)):
+    for place, value in (((0, 0), 0.5), ((1, 0), 1.5), ((2, 1), 3.1), ((1, 2), -1.0), ((2, 2), 181.0)):
         bad = good.copy()
         bad[place] = value
         assert small.impossible("both", one, bad)

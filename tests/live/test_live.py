@@ -8,7 +8,9 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -432,6 +434,22 @@ def test_each_artifact_of_a_run_is_exported_for_itself(
     assert made == [("columns", "rows", "checks"), ("checks", "rows", "columns")]
     with pytest.raises(ValueError, match="no input for depth: leave --depth out"):
         _engine(str(artifact), 1, ("depth",))
+
+
+def test_a_run_is_exported_again_for_other_data(
+    smoke_run: Path, onnx: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its weights are the same, but labels and units of its data, or its windows, are not."""
+    made: list[Path] = []
+    monkeypatch.setattr("mvitac.deploy.export.export", lambda m, p, out, c: made.append(shutil.copytree(onnx, out)))
+    monkeypatch.setattr("mvitac.deploy.publish.with_probes", lambda model, data: model)
+    monkeypatch.setenv("MVITAC_CACHE", str(tmp_path / "cache"))
+    other = SimpleNamespace(digest="0" * 64, spec=pack.spec)
+    unit = SimpleNamespace(digest=pack.digest, spec=replace(pack.spec, notes=("in mN",)))
+    for data in (pack, other, unit, pack):
+        monkeypatch.setattr("mvitac.deploy.publish.own_data", lambda *_, data=data, **__: data)
+        _engine(str(smoke_run), 1)
+    assert len(made) == 3
 
 
 def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

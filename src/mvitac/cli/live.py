@@ -274,14 +274,15 @@ def _engine(model: str, threads: int, modalities: tuple[Any, ...] = (), *, most:
     check(modalities or loaded.encoders)  # before the export, which takes longer
     for m in {*modalities} - {*loaded.encoders}:
         raise ValueError(f"the model has no input for {m}: leave --{m} out")
-    # Artifacts of one run differ in their probes only. A run has none: its data decides those that are fitted below.
-    probes = [[to_json(r.info), safetensors_digest(dict(r.state_dict()))] for r in loaded.probes.values()]
-    key = digest([EXPORT.version, loaded.weights_digest(), probes, *modalities])
-    folder = cache_dir() / "exports" / key[:32]
+    # Artifacts of one run differ in their probes. A run has none: its data, as it is now, decides those that are fitted.
+    probes: list[Any] = [[to_json(r.info), safetensors_digest(dict(r.state_dict()))] for r in loaded.probes.values()]
+    how = "`mvitac export MODEL --on PACK --out DIR` first, and give DIR"
+    pack = None if probes else own_data(loaded, how)
+    about = [to_json(loaded.spec), probes or (pack and [pack.digest, to_json(pack.spec)])]
+    folder = cache_dir() / "exports" / digest([EXPORT.version, loaded.weights_digest(), about, *modalities])[:32]
     if not folder.exists():
         _say(f"exporting {model}, once")
-        how = "`mvitac export MODEL --on PACK --out DIR` first, and give DIR"
-        pack = own_data(loaded, how, few=100 * bool(loaded.probes))
+        pack = pack or own_data(loaded, how, few=100)
         with shown():
             export(with_probes(loaded, pack), pack, folder, ExportConfig(modalities=modalities))
     return Engine(folder, threads=threads)
