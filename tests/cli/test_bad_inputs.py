@@ -377,8 +377,10 @@ def test_an_output_that_is_an_input(refused: Callable[..., str], finished: Path)
     (frame := finished / "frames" / "3.png").write_bytes(b"0")
     for source in ("frames", "frames@30", "frames@30#0:0:9:9", "."):
         refused(f"predict e {finished}/{source} --out {frame}", "would overwrite what the command reads")
-    (table := frame.parent.parent / "t.csv").touch()
+    (table := frame.with_name("t.csv")).write_text("touch\nframes/3.png\n")
     refused(f"predict e {table} --out {frame}", "would overwrite what the command reads")
+    (frame.with_name("look.png")).touch()  # beside a table, that of last time
+    refused(f"predict e {table} --out {frame.with_name('look.png')}", "no trained model at e")
     (link := frame.with_name("link")).symlink_to(finished / "run.json")
     refused(f"probe {finished} --json {link}", "would overwrite what the command reads")
     refused(f"find x.png --model {finished} --known k --sheet {finished}/pack.json", "give the name of a .png file")

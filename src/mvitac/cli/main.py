@@ -133,7 +133,7 @@ def _check_choices(rest: Sequence[str], text: Path) -> None:
 
 
 def _check_outputs(words: Sequence[str]) -> None:
-    """ValueError for an output that is an input, or a file with a name of ``OWN`` in its folder or that of a table."""
+    """ValueError for an output that is an input, or a file with a name of ``OWN`` in such a folder, or in a table's text."""
     places = [part for word in words for part in word.split("=")]
     for at, (option, out) in enumerate(itertools.pairwise(places)):
         if option in ("--out", "--json", "--sheet") and os.path.isfile(out):
@@ -143,10 +143,11 @@ def _check_outputs(words: Sequence[str]) -> None:
             ]
             inputs = [place for place in parts if os.path.exists(place)]
             file = Path(out).resolve()
-            folders = [os.path.dirname(p) if p.endswith((".csv", ".jsonl", ".parquet")) else p for p in inputs]
-            own = {os.path.realpath(folder) for folder in folders if file.name.lower().endswith(OWN)}
-            inside = own & {os.fspath(folder) for folder in file.parents}
-            if inside or any(os.path.samefile(out, place) for place in inputs):
+            own = [Path(place).resolve() for place in inputs if file.name.lower().endswith(OWN)]
+            tables = [place for place in own if place.is_file() and place.suffix in (".csv", ".jsonl")]
+            inside = any(place in file.parents for place in own)
+            listed = any(file.name.encode() in table.read_bytes() for table in tables)
+            if inside or listed or any(os.path.samefile(out, place) for place in inputs):
                 raise ValueError(f"{option} {out} would overwrite what the command reads: choose another file")
 
 

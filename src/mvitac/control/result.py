@@ -115,12 +115,9 @@ def _problems(value: dict[str, Any], suite: Suite) -> Iterator[str]:
             whole = len(n) == suite.num and (n == suite.scored).all() and np.isfinite(sums).all()
             if not whole or suite.impossible(cell["task"], n, np.array(sums)):
                 yield f"{who}, {cell['task']}, {cell['condition']}: no episodes give these sums"
-    several: dict[str, list[Any]] = {}
-    for row in value["rows"]:
-        several.setdefault(row["source"], []).append(row["cells"])
-    for name, rows in several.items():
-        if any(rows.count(cells) > 1 for cells in rows):
-            yield f"{name or 'the encoder'} has two seeds with the same sums in every cell"
+    rows = [(row["source"], row["cells"]) for row in value["rows"]]
+    for name in {row[0] for row in rows if rows.count(row) > 1}:
+        yield f"{name or 'the encoder'} has two seeds with the same sums in every cell"
     true = next(row["cells"] for row in value["rows"] if row["source"] == suite.true)
     for cell, again in zip(true, score(suite, Row(suite.true, None, None)), strict=True):
         if not np.allclose(*([one[key] for key in suite.sums] for one in (cell, again)), rtol=1e-3, atol=1e-3):

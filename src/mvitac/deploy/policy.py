@@ -83,8 +83,8 @@ class ObservationEncoder(nn.Module):
                 image = observation[name]
                 if image.shape[:-3] != lead:
                     raise ValueError(f"{name}: {list(image.shape)} does not fit images of {list(first.shape)}")
-                flat, wait = image.flatten(0, -4), image.is_cpu or name not in self._checked
-                images = check_images(flat, 3, name, values=wait)  # on a GPU, the values of the first only
+                check = image.is_cpu or name not in self._checked  # on a GPU, the values of the first only
+                images = check_images(image.flatten(0, -4), 3, name, values=check)
                 self._checked.add(name)
                 views.append(self._input(modality, resized(images, self.stored)))
             with torch.set_grad_enabled(self.tune and torch.is_grad_enabled()):

@@ -43,6 +43,14 @@ def fitting(model: Model, pack: Pack, among: Sequence[str] = MODALITIES) -> tupl
     return names
 
 
+def fitting_in_use(model: Model, pack: Pack, among: Sequence[str] = MODALITIES) -> tuple[str, ...]:
+    """As ``fitting``; ValueError also for difference images, where the model will be given plain ones."""
+    names = fitting(model, pack, among)
+    if "touch" in names and pack.spec.difference and not model.spec.difference:
+        raise ValueError(f"{pack.path}: the model was trained without difference images: no --subtract-background")
+    return names
+
+
 def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool = False) -> np.ndarray:
     """Features [len(rows), D] float32, cached on disk by weights, data, rows and image size (``Model.features``).
 

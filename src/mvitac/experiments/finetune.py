@@ -286,6 +286,7 @@ def _held_out_error(job: _Job, percent: float, kind: str, settings: dict[str, An
             train(run, work / key, resume=True, quiet=True, loggers=(job.forecast,), pack=job.pack, validate=False)
         except Diverged:
             job.say(f"{percent:g} %: {name}: diverged")
+            shutil.rmtree(work)
             return float("inf")
         learned, model = run.method.training_rows(job.pack), load(work / key)
         held = np.setdiff1d(job.method(percent, 0).training_rows(job.pack), learned)
