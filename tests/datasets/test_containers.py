@@ -109,6 +109,9 @@ def test_lerobot_of_version_2_has_a_file_per_episode(tmp_path: Path) -> None:
     for i in range(32):
         assert abs(level(pack.images["vision"][i]) - shade(frame[i], episode[i])) < 6
         assert abs(level(pack.images["touch"][i]) - shade(frame[i], episode[i] + 1)) < 6
+    (root / "meta/tasks.jsonl").write_text('{"task_')
+    with pytest.raises(ValueError, match=r"tasks\.jsonl cannot be read .*: fetch it again"):
+        LeRobotConfig(path=root, labels=("task",)).source()
 
 
 @pytest.mark.parametrize("gel_rate", [10, 30])
@@ -176,7 +179,7 @@ def test_lerobot_says_what_is_missing(tmp_path: Path) -> None:
     for place in (f"{tmp_path}/old/videos/", "../old/videos/"):
         file.write_text(about.replace('"videos/', f'"{place}'))
         refused(root, "video_path leads out of the dataset, to ")
-    for field in ("{video_key:>2000000000}", "{video_key.__class__}", "{video_key!r:>9}"):
+    for field in ("{video_key:>9000}", "{video_key.__class__}", "{video_key!r:>9}"):
         file.write_text(about.replace("{video_key}", field))
         refused(root, r"video_path is .*, not of fields such as \{file_index:03d\}")
     file.write_text(about)
