@@ -22,6 +22,7 @@ KINDS: dict[str, tuple[str, dict[str, Any]]] = {
     "mov": ("v.mov", {"gop": 1000}),  # one key frame for all
     "mjpeg": ("v.avi", {"codec": "mjpeg"}),
     "h264": ("v.mp4", {"codec": "libx264", "gop": 40, "b_frames": 3}),
+    "h264-mkv": ("v.mkv", {"codec": "libx264", "gop": 40, "b_frames": 3}),  # its first packets have no decoding times
     "h264-open": ("v.mp4", {"codec": "libx264", "b_frames": 3, "options": {"x264-params": "open-gop=1:keyint=20"}}),
 }
 
@@ -154,6 +155,8 @@ def test_frames_come_as_they_are_decoded(made: dict[str, Path], count: dict[str,
 def test_a_damaged_packet_costs_frames_up_to_the_next_key_frame(path: Path, tmp_path: Path, harm: str) -> None:
     good = dict(frames(path, range(NUM)))
     at, size = packets_of(path)[75]
+    if path.suffix == ".mkv":  # the place is that of a header without which the packet is not there
+        at, size = at + 16, size - 16
     whole = path.read_bytes()[at : at + size]
     middle = size // 2
     data = {

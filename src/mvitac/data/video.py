@@ -47,6 +47,10 @@ class Packets(NamedTuple):
         """Number of displayed frames."""
         return int(self.before[-1])
 
+    def is_at(self, number: int, packet: Packet) -> bool:
+        """Whether ``packet`` has the place of packet ``number``, or 8 more, without the header of an AVI chunk."""
+        return packet.pos is not None and packet.pos - int(self.places[number]) in {0, 8}
+
     def start_of(self, frame: int) -> int:
         """The index in ``keys`` of the last key packet with at most ``frame`` frames stored before it."""
         return max(0, int(np.searchsorted(self.before[self.keys], frame, side="right")) - 1)
@@ -121,9 +125,8 @@ class _Run:
         self.fed = int(packets.keys[key])  # number of the packet given to the decoder last
         self.trouble = ""  # error in the stream that affects frames up to the next key frame; "" = none
         self._hurt = 0  # display time of the damaged frame
-        dts = int(packets.dts[self.fed])
-        container.seek(dts, stream=stream, backward=True)
-        found = itertools.dropwhile(lambda packet: packet.dts != dts, container.demux(stream))
+        container.seek(int(packets.dts[self.fed]), stream=stream, backward=True)
+        found = itertools.dropwhile(lambda packet: not packets.is_at(self.fed, packet), container.demux(stream))
         self._demuxed = (packet for packet in found if packet.size)
         # Frames displayed before a key frame may be stored directly after it. They refer to packets before the key
         # frame, so they belong to the previous run. Their number determines the frame number of the key frame.
@@ -143,10 +146,8 @@ class _Run:
         for packet in self._all():
             if packet is not None:
                 self.fed += packet is not self._ahead[0]
-                # Its place must be that of packet ``fed``, or 8 more, without the header of an AVI chunk: after damage, a
-                # demuxer may silently skip packets.
-                place = self._packets.places[self.fed] if self.fed < len(self._packets.places) else None
-                if place is None or packet.pos is None or packet.pos - int(place) not in {0, 8}:
+                # After damage, a demuxer may silently skip packets.
+                if self.fed >= len(self._packets.places) or not self._packets.is_at(self.fed, packet):
                     self._note("its packet table and its packets disagree", _shown(packet))
                 if _shown(packet) >= self._shown and not packet.is_discard:
                     insort(due, _shown(packet))
@@ -228,6 +229,9 @@ def _read_packets(path: str, size: int, changed: int) -> Packets:
             found = [(p.dts, p.pos, p.is_keyframe, p.is_discard) for p in container.demux(stream) if p.size]
         if table is None and avi and len(found) != stream.frames:
             raise ValueError(f"{path} is damaged, and PyAV {av.__version__} cannot number its frames: use 18 or newer")
+    # The first packets of a Matroska file with B-frames have no decoding time: they get one before the first known.
+    late = next((i for i, (dts, *_) in enumerate(found) if dts is not None), 0)
+    found[:late] = [(found[late][0] - late + i, *rest) for i, (_, *rest) in enumerate(found[:late])]
     before = np.cumsum([0, *(not cut for *_, cut in found)])
     if not before[-1] or any(dts is None or place is None for dts, place, *_ in found):
         raise ValueError(f"{path} holds no frames that can be told apart: it is damaged, or convert it to mp4")
