@@ -317,6 +317,12 @@ def no_vision(value: dict[str, Any]) -> None:
     value["blocks"][0]["left_out"] = {"both": "x"}
 
 
+def other_frames(value: dict[str, Any]) -> None:
+    """A set is left out as if the run took windows, in which it scored another set's single frames."""
+    for block in value["blocks"][:2]:
+        not_run(block, "the encoder takes windows of 3 frames, the data has single ones")
+
+
 def simulated(value: dict[str, Any]) -> None:
     """Of a set that can be made anywhere, nothing was run."""
     value["suite"]["sets"][2]["forms"][0]["at"] = {}
@@ -364,6 +370,12 @@ FORGED: dict[str, tuple[Change, str]] = {
     "no reason": (no_vision, "stripes, pattern: both cannot be left out because x"),
     "no reason for a task": (lambda value: not_run(value["blocks"][1]), "touch cannot be left out because no time"),
     "untrue of a set": (lambda value: not_run(value["blocks"][1], "the encoder takes"), "light: touch cannot be left"),
+    "windows of a set": (
+        other_frames,
+        "stripes, pattern: touch and both cannot be left out because the encoder takes windows",
+    ),
+    "weights of no digest": (put("encoder", "weights", value=[1]), "a digest of weights is none"),
+    "no versions": (put("versions", value=None), "its versions are no texts"),
     "simulated": (simulated, "elsewhere, pattern: vision cannot be left out because .*elsewhere is not there"),
     "leak": (put("blocks", 0, "leaks", value=[-1]), "a leak mark, a note, a group or what"),
     "group by": (lambda value: value["blocks"][0].pop("group_by"), "a leak mark, a note, a group or what"),

@@ -153,8 +153,18 @@ def _twin(value: dict[str, Any]) -> None:
     second["cells"] = first["cells"]
 
 
+def _not_lost(value: dict[str, Any]) -> None:
+    cell = next(row for row in value["rows"] if row["source"] == "no touch")["cells"][0]
+    limit, n = task_of(cell["task"]).limit, cell["n"][0]
+    cell["mm"][0], cell["deg"][0] = n * limit[0], n * float(np.hypot.reduce(limit[1:]))
+
+
 CHANGES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "no episodes give": put("rows", 0, "cells", 0, "mm", 0, value=-1.0),
+    "no touch, .* no episodes give": _not_lost,
+    "no digests of what": put("data", "edge", value=None),
+    "versions are no texts": put("versions", value=None),
+    "a digest of weights is none": put("encoder", "weights", 0, value=1),
     "other sums here": _true,
     "the suite asks for": lambda value: value["rows"].pop(3),
     "not of this version's": _late,
@@ -165,7 +175,7 @@ CHANGES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "has the unknown field 'score'": put("rows", 0, "cells", 0, "score", value=1.0),
     "a sum is no number": put("rows", 0, "cells", 0, "mm", 0, value="1.0"),
     "untrained has two seeds with the same sums": _twin,
-    "weights for seeds": lambda value: value["encoder"]["weights"].append("0"),
+    "weights for seeds": lambda value: value["encoder"]["weights"].append("0" * 64),
 }
 
 
@@ -194,6 +204,21 @@ def test_a_star_is_over_shapes_and_seeds(small: Servo) -> None:
         return result._cell(small, known, "pixels", ("straight", "late")).endswith("*")
 
     assert marked((2.0, 2.02)) and not marked((2.0, 1.2))
+
+
+def test_each_encoder_is_beside_the_controls_of_its_result(small: Servo) -> None:
+    def value(name: str, untrained: float) -> dict[str, Any]:
+        cell = {"task": "straight", "condition": "late", "n": [4.0] * 8, "deg": [0.0] * 8, "lost": [0.0] * 8}
+        rows = [("", 0, 1.0), ("untrained", 0, untrained), ("pixels", None, 3.0)]
+        cells = ({"source": s, "seed": k, "cells": [cell | {"mm": [4 * mm] * 8}]} for s, k, mm in rows)
+        return {"rows": list(cells), "encoder": {"name": name}}
+
+    values = [value("far", 2.0), value("level", 1.0)]
+    for each in (values, values[::-1]):
+        known = result.scores(each)
+        texts = {name: result._cell(small, known, name, ("straight", "late")) for name in known}
+        assert texts["far"].endswith("*") and not texts["level"].endswith("*")
+        assert [name for name in known if ", with" in name] == [f"untrained, with {each[1]['encoder']['name']}"]
 
 
 def first_look(suite: Servo, source: str, asked: float = 0.0) -> tuple[list[np.ndarray], list[dict[str, Any]]]:

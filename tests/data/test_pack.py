@@ -165,6 +165,15 @@ def almost_finished(path: Path, source: Source) -> Path:
     return path.with_name(path.name + ".partial")
 
 
+def test_what_is_not_ours_is_left(tmp_path: Path) -> None:
+    (tmp_path / "p.partial" / "pack").mkdir(parents=True)
+    (tmp_path / "q").symlink_to(tmp_path / "nowhere")
+    for name, says in {"p": r"p\.partial is no unfinished pack", "q": "q already exists"}.items():
+        with pytest.raises(ValueError, match=says):
+            build(Toy(), tmp_path / name, size=32, quiet=True)
+    assert (tmp_path / "p.partial" / "pack").is_dir()
+
+
 @pytest.mark.parametrize("lost", ["row", "end of the images", "list", "half of the list", "end of a line", "a stamp"])
 def test_what_lost_power_took_is_read_again(pack: Pack, tmp_path: Path, lost: str) -> None:
     partial = almost_finished(tmp_path / "p", Toy())

@@ -208,6 +208,11 @@ def test_frames_that_are_not_there(made: dict[str, Path]) -> None:
 
 
 def test_files_that_are_no_videos(made: dict[str, Path], tmp_path: Path) -> None:
+    (tmp_path / "cut.mkv").write_bytes(
+        write_video(tmp_path / "v.mkv", 2, lambda i: numbered(i, "touch")).read_bytes()[:700]
+    )
+    with pytest.raises(ValueError, match=r"cut\.mkv holds no frames: it is damaged or cut off"):
+        video.frame_times(tmp_path / "cut.mkv")
     whole = made["mpeg4"].read_bytes()  # half of it lacks its table
     for name, data in {
         "text.mp4": b"not a video " * 100,

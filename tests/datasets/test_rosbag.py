@@ -10,7 +10,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from mvitac.data.build import build
 from mvitac.data.images import ros_pixels
 from mvitac.data.pack import Pack
-from mvitac.datasets.rosbag import RosbagConfig
+from mvitac.datasets.rosbag import Message, RosbagConfig
 from support.ros import START, STORE, compressed, raw, stamped
 
 GEL, FRONT, WRENCH = "/digit/image_raw", "/camera/image/compressed", "/ft/wrench"
@@ -113,6 +113,17 @@ def test_clocks_that_pair_nothing(tmp_path: Path, gel: list[float], front: list[
             with pytest.raises(ValueError, match=f"{file.name} was not closed"):
                 RosbagConfig(path=tmp_path, touch=(GEL,)).source()
             (tmp_path / "bag" / "metadata.yaml").unlink(missing_ok=True)
+
+
+def test_messages_that_are_not_there_are_told(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", StoragePlugin.MCAP, 0)
+    about = bag / "metadata.yaml"
+    about.write_text(about.read_text().replace("message_count: 50\n", "message_count: 70\n"))
+    with pytest.raises(ValueError, match=f"bag has 50 of 70 messages of {GEL}: fetch it again"):
+        RosbagConfig(path=bag, touch=(GEL,)).source()
+    ref = Message(str(bag), FRONT, START * 10**9, 9)
+    with pytest.raises(ValueError, match="number 9 is not found again: its files are"), ref.opened() as opened:
+        ref.stored(opened)
 
 
 def test_a_short_image_is_named(tmp_path: Path) -> None:

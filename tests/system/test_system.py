@@ -45,6 +45,9 @@ def test_what_another_process_writes_is_left_to_it(name: str, smoke_run: Path, p
 def test_a_new_folder_is_complete_or_not_there(tmp_path: Path) -> None:
     (tmp_path / "out.partial").mkdir()
     (tmp_path / "out.partial" / "of a killed process").touch()
+    with pytest.raises(ValueError, match=r"out\.partial already exists"), new_folder(tmp_path / "out"):
+        pass  # it may be anybody's
+    (tmp_path / "out.lock").touch()
     with pytest.raises(ZeroDivisionError), new_folder(tmp_path / "out") as partial:
         (partial / f"{1 / len(list(partial.iterdir()))}").touch()  # it is empty
     assert not list(tmp_path.iterdir())

@@ -13,6 +13,7 @@ someone repeats them.
 """
 
 import json
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -44,6 +45,7 @@ EXTERNAL = ("encoder", "title", "seed", "weights", "notes", "encoders")
 BLOCK = ("set", "task", "not_run", "form", "data", "group_by", "groups", "leaks", "left_out", "records", "notes")
 NO_IMAGENET = "without the control imagenet"  # a note
 MISFIT = ("the encoder takes ", "the encoder was trained on touch ")  # reasons of runs alone (``misfit``)
+WINDOWS = "the encoder takes windows"  # a reason that holds for all data
 GUESS = "majority or mean"  # what the page calls these two controls
 MAX_NAME = 200
 
@@ -160,7 +162,8 @@ def problems(value: dict[str, Any]) -> list[str]:
     scored: dict[str, set[str]] = {one.name: set() for one in suite.sets}
     for block, record in ((b, r) for b in value["blocks"] for r in b.get("records", ()) if not r["source"]):
         scored[block["set"]] |= _senses(record["modality"])
-    reads = {*encoder["parameters"], *encoder.get("features", ())}.union(*scored.values())
+    anywhere: set[str] = set().union(*scored.values())
+    reads = {*encoder["parameters"], *encoder.get("features", ()), *anywhere}
     here = {one.name for one in suite.sets for form in one.forms if not form.at}  # data that can be had anywhere
     here |= {block["set"] for block in value["blocks"] if "data" in block}
     for block, (one, ask) in zip(value["blocks"], asked, strict=True):
@@ -169,7 +172,8 @@ def problems(value: dict[str, Any]) -> list[str]:
         given: list[tuple[Sequence[str], str]] = [((m,), why) for m, why in block.get("left_out", {}).items()]
         if "not_run" in block and (one.name in here or block["not_run"].startswith("the encoder ")):
             given.append((ask.modalities, block["not_run"]))
-        untrue = [each for each in given if _untrue(*each, encoder, reads, scored[one.name])]
+        beside = {why: anywhere if why.startswith(WINDOWS) else scored[one.name] for _, why in given}
+        untrue = [each for each in given if _untrue(*each, encoder, reads, beside[each[1]])]
         found += [f"{one.name}, {ask.name}: {' and '.join(m)} cannot be left out because {why}" for m, why in untrue]
         if "not_run" not in block:
             found += [f"{one.name}, {ask.name}: {text}" for text in _of_block(block, suite, one, ask, encoder)]
@@ -189,10 +193,16 @@ def _untrue(modalities: Sequence[str], why: str, encoder: dict[str, Any], reads:
 
 def unknown_fields(value: dict[str, Any], parts: Sequence[tuple[dict[str, Any], Sequence[str]]]) -> Iterator[str]:
     """Fields of ``parts``, and of what all results have, that nobody reads."""
-    encoder = value["encoder"]
+    encoder, versions = value["encoder"], value["versions"]
+    if not isinstance(versions, dict) or not all(isinstance(text, str) for text in versions.values()):
+        yield "its versions are no texts"
     shared = (value.get("about", {}), ABOUT), (encoder, ENCODER), (encoder.get("external", {}), EXTERNAL)
     for fields, known in (*shared, *parts):
         yield from (f"has the unknown field {name!r}" for name in sorted(fields.keys() - {*known}))
+
+
+def are_digests(texts: Sequence[Any]) -> bool:
+    return all(re.fullmatch("[0-9a-f]{64}", str(text)) for text in texts)
 
 
 def wrong_name(name: str, controls: Sequence[str]) -> str:
@@ -212,6 +222,8 @@ def problems_of(encoder: dict[str, Any], controls: Sequence[str]) -> Iterator[st
     yield from (f"{key} is {number}" for key, number in numbers.items() if not 0 <= number < 1e18)
     texts = {key: encoder.get(key) for key in ("licence", "trained_on")}
     yield from (f"{key} is no text" for key, text in texts.items() if not isinstance(text, str | None))
+    if not are_digests(weights):
+        yield "a digest of weights is none"
     if not len(seeds) == len(set(seeds)) == len(set(weights)) == len(weights):
         yield f"has {len(set(weights))} weights for seeds {seeds}"
 

@@ -237,7 +237,7 @@ class Insert(LoopSuite):
         """Whether no episodes give these sums [3, episodes]: success needs a small error."""
         success, mm, deg = sums
         small = (mm <= self.success_mm) & (deg <= self.success_deg)
-        possible = np.isin(success, (0, 1)) & (small | (success == 0)) & (deg <= 180)
+        possible = np.isin(success, (0, 1)) & (small | (success == 0)) & (deg <= 180) & (mm <= 1000)
         return not (possible.all() and (sums >= 0).all())
 
     def text(self, cells: Sequence[dict[str, Any]]) -> str:

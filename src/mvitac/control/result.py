@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mvitac.bench.encoder import About, measure
-from mvitac.bench.result import FIELDS, problems_of, read_signed, unknown_fields
+from mvitac.bench.result import FIELDS, are_digests, problems_of, read_signed, unknown_fields
 from mvitac.bench.score import kept_part
 from mvitac.control.ablate import suite_episodes
 from mvitac.control.insert import Insert
@@ -102,6 +102,8 @@ def _problems(value: dict[str, Any], suite: Suite) -> Iterator[str]:
     parts = [(value, (*FIELDS, "data", "rows")), *((row, ("source", "seed", "cells")) for row in value["rows"])]
     cells = [cell for row in value["rows"] for cell in row["cells"]]
     yield from unknown_fields(value, [*parts, *((cell, ("task", "condition", "n", *suite.sums)) for cell in cells)])
+    if not value["data"] or not are_digests(value["data"].values()):
+        yield "it has no digests of what was learned from"
     yield from problems_of(value["encoder"], ["imagenet", *(source for source, _ in (*want, *rest))])
     for row in value["rows"]:
         who = row["source"] or "the encoder"
@@ -125,7 +127,7 @@ def _problems(value: dict[str, Any], suite: Suite) -> Iterator[str]:
 
 
 def scores(values: Sequence[dict[str, Any]]) -> Scored:
-    """The cells of all seeds of each row; controls are those of the last result."""
+    """The cells of all seeds of each row; "SOURCE, with ENCODER" where a control is not that of the results before."""
     found: Scored = {}
     for value in values:
         mine: Scored = {}
@@ -133,7 +135,9 @@ def scores(values: Sequence[dict[str, Any]]) -> Scored:
             for cell in row["cells"]:
                 of = mine.setdefault(row["source"] or value["encoder"]["name"], {})
                 of.setdefault((cell["task"], cell["condition"]), []).append({**cell, "seed": row["seed"]})
-        found |= mine
+        for source, cells in mine.items():
+            other = found.setdefault(source, cells) != cells
+            found[f"{source}, with {value['encoder']['name']}" if other else source] = cells
     return found
 
 
@@ -150,7 +154,8 @@ def _cell(suite: Suite, known: Scored, source: str, key: tuple[str, str]) -> str
     """Errors and interval, and * where the row differs from the untrained trunk."""
     if not (cells := known[source].get(key)):
         return ""
-    ours, theirs = ([suite.record(cell) for cell in each] for each in (cells, known["untrained"][key]))
+    beside = known.get(f"untrained, with {source.rpartition(', with ')[2]}", known["untrained"])  # of the same result
+    ours, theirs = ([suite.record(cell) for cell in each] for each in (cells, beside[key]))
     _, low, high, _ = paired_difference(ours, theirs)
     return suite.text(cells) + " *" * (low > 0 or high < 0)
 

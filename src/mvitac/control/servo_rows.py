@@ -98,6 +98,7 @@ class Servo(LoopSuite):
         limit, lost = task_of(task).limit, sums[2]
         most = np.array([limit[:1], [np.hypot.reduce(limit[1:])]])
         inside = (sums[:2] >= lost * most - 1e-6) & (sums[:2] <= n * most + 1e-6)
+        inside &= (lost > 0) | (sums[:2] < n * most - 1e-6)
         return not (inside.all() and (lost >= 0).all() and (lost == lost.round()).all())
 
     def text(self, cells: Sequence[dict[str, Any]]) -> str:

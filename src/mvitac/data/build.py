@@ -75,8 +75,13 @@ def build(
     out = Path(out)
     check_request(store, size=size, workers=workers, max_damaged=max_damaged, quality=quality)
     if not out.exists() or not exist_ok:  # also takes away the lock of a process that was killed at its end
-        with hold_lock(out, f"{out} is being packed by another process: waiting for it", wait=True, quiet=quiet):
-            if not out.exists():
+        with hold_lock(
+            out, f"{out} is being packed by another process: waiting for it", wait=True, quiet=quiet
+        ) as left:
+            partial = out.with_name(out.name + ".partial")
+            if partial.exists() and not (left or (partial / "request.json").exists()):
+                raise ValueError(f"{partial} is no unfinished pack: delete it, or choose another --out")
+            if not os.path.lexists(out):
                 # What identifies a pack; it is kept in request.json and pack.json.
                 request = {"fingerprint": source.fingerprint(), "size": size, "spec": to_json(source.spec())}
                 return _build(source, out, request | stored_as(store, quality), workers, max_damaged, quiet)

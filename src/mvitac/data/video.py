@@ -65,6 +65,8 @@ def frame_times(path: str | Path) -> np.ndarray:
     """Return the display times in seconds [N], ascending; ValueError or OSError if it cannot be read as a video."""
     with _opened(path) as (container, stream):
         shown = [p.pts for p in container.demux(stream) if p.size and not p.is_discard and p.pts is not None]
+        if not shown:
+            raise ValueError(f"{path} holds no frames: it is damaged or cut off")
         return np.sort(np.array(shown, float)) * float(stream.time_base or 0)
 
 

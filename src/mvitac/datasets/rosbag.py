@@ -136,6 +136,9 @@ def _read(bag: Path, cameras: Sequence[str], asked: Sequence[str]) -> dict[str, 
             time = 1e-9 * received if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
             row = {name: _field(message, name[len(topic) + 1 :], f"{bag}, {topic}") for name in fields.get(topic, ())}
             found[topic].append((time or 1e-9 * received, row or place))
+        for topic, each in found.items():
+            if len(each) != (num := sum(c.msgcount for c in asked_for if c.topic == topic)):
+                raise ValueError(f"{bag} has {len(each)} of {num} messages of {topic}: fetch it again, or reindex it")
     ordered = {topic: sorted(each, key=lambda one: one[0]) for topic, each in found.items()}
     return {topic: (np.array([time for time, _ in each]), [v for _, v in each]) for topic, each in ordered.items()}
 
@@ -182,5 +185,8 @@ class Message(ImageRef):
 
     def stored(self, container: tuple[Any, Iterator[Any]]) -> bytes | np.ndarray:
         reader, messages = container
-        connection, _, raw = next(found for found in messages if found[1] == (self.stamp, self.number))
+        found = next((found for found in messages if found[1] == (self.stamp, self.number)), None)
+        if not found:
+            raise ValueError(f"{self} is not found again: its files are not in the order of time, reindex the bag")
+        connection, _, raw = found
         return ros_pixels(reader.deserialize(raw, connection.msgtype), str(self))

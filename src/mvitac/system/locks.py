@@ -17,14 +17,17 @@ class Busy(ValueError):
 
 
 @contextmanager
-def hold_lock(place: Path, busy: str, *, wait: bool, quiet: bool = False) -> Iterator[None]:
+def hold_lock(place: Path, busy: str, *, wait: bool, quiet: bool = False) -> Iterator[bool]:
     """Hold the file lock ``<place>.lock`` of a pack or run. A thread may hold the same lock twice.
+
+    Yields whether the file was there: a process that was killed left it.
 
     Locks work between machines if their shared file system supports them; otherwise nothing is locked. If another
     process holds it, ``wait`` for it after printing ``busy`` (unless ``quiet``), or raise ``Busy`` with that message.
     """
     # No soft lock: it would remain after a process is killed.
     lock = FileLock(f"{place.absolute()}.lock", fallback_to_soft=False, is_singleton=True)
+    left = os.path.exists(lock.lock_file)
     try:
         lock.acquire(blocking=False)
     except Timeout:
@@ -37,7 +40,7 @@ def hold_lock(place: Path, busy: str, *, wait: bool, quiet: bool = False) -> Ite
         if error.errno != errno.ENOSYS:
             raise
     try:
-        yield
+        yield left
     finally:
         if lock.lock_counter <= 1:  # not held once more by an outer block
             Path(lock.lock_file).unlink(missing_ok=True)  # filelock detects a deleted lock file
@@ -51,10 +54,12 @@ def new_folder(out: Path) -> Iterator[Path]:
     Raises Busy if another process writes ``out``, ValueError if it exists or cannot be written.
     """
     check_place(out)
-    with hold_lock(out, f"{out} is being written by another process: wait, or choose another place", wait=False):
-        if out.exists():
-            raise ValueError(f"{out} already exists: choose another place, or delete it first")
+    busy = f"{out} is being written by another process: wait, or choose another place"
+    with hold_lock(out, busy, wait=False) as left:
         partial = out.with_name(out.name + ".partial")
+        for place in (out, *[partial] * (not left)):
+            if os.path.lexists(place):
+                raise ValueError(f"{place} already exists: choose another place, or delete it first")
         shutil.rmtree(partial, ignore_errors=True)  # of a process that was killed
         partial.mkdir(parents=True)
         try:
