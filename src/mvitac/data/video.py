@@ -232,12 +232,13 @@ def _read_packets(path: str, size: int, changed: int) -> Packets:
         if table is None and avi and len(found) != stream.frames:
             raise ValueError(f"{path} is damaged, and PyAV {av.__version__} cannot number its frames: use 18 or newer")
     # The first packets of a Matroska file with B-frames have no decoding time: they get one before the first known.
-    late = next((i for i, (dts, *_) in enumerate(found) if dts is not None), 0)
-    found[:late] = [(found[late][0] - late + i, *rest) for i, (_, *rest) in enumerate(found[:late])]
+    times = [row[0] for row in found]
+    late = next((i for i, dts in enumerate(times) if dts is not None), 0)
+    times[:late] = [(times[late] or 0) - late + i for i in range(late)]
     before = np.cumsum([0, *(not cut for *_, cut in found)])
-    if not before[-1] or any(dts is None or place is None for dts, place, *_ in found):
+    if not before[-1] or None in times or any(place is None for _, place, *_ in found):
         raise ValueError(f"{path} holds no frames that can be told apart: it is damaged, or convert it to mp4")
-    dts, places = (np.array([row[i] for row in found], np.int64) for i in (0, 1))
+    dts, places = np.array(times, np.int64), np.array([row[1] for row in found], np.int64)
     keys = np.flatnonzero([key for _, _, key, _ in found])
     if (np.diff(dts) <= 0).any() and before[-1] < len(dts):
         raise ValueError(f"{path} is put together from pieces by an edit list: encode it again, ffmpeg -i IN OUT.mp4")
