@@ -114,9 +114,10 @@ def _run(arguments: list[str]) -> int:
 
 
 def _check_once(words: Sequence[str]) -> None:
-    """ValueError for an option that is given twice: only the last one would count."""
+    """ValueError for an option that is given twice, also as --no-OPTION: only the last one would count."""
     names = [word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")]
-    if twice := [name for name in names if names.count(name) > 1]:
+    plain = [re.sub(r"(^--|\.)no-", r"\1", name) for name in names]
+    if twice := [name for name, one in zip(names, plain, strict=True) if plain.count(one) > 1]:
         raise ValueError(f"{twice[0]} is given twice: give it once, with all its values")
 
 

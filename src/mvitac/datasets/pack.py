@@ -30,6 +30,9 @@ class PackConfig(DatasetConfig):
 
     def _frames(self, quiet: bool) -> Pack:
         pack = Pack(self.path)
+        for name in (n for n, own in (("size", pack.size), ("store", "raw")) if getattr(self, n) != own):
+            if getattr(self, name) != getattr(DatasetConfig, name):
+                raise ValueError(f"--data.{name} is for what is packed now, a pack stays as it is: leave it out")
         if self.score_on == "val":
             if not len(pack.rows("val")):
                 raise ValueError(f"{self.path} has no split val to score on: leave out --data.score-on")

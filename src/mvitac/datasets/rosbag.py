@@ -125,6 +125,9 @@ def _read(bag: Path, cameras: Sequence[str], asked: Sequence[str]) -> dict[str, 
                 raise ValueError(f"{bag}: {unknown('topic', topic, topics)}")
             if not topics[topic].endswith("Image"):
                 raise ValueError(f"{bag}: {topic} is of {topics[topic]}, no images")
+        for name in asked:
+            if name.startswith(tuple(f"{topic}." for topic in cameras)):
+                raise ValueError(f"{name} is of a topic of images, which has no columns")
         fields = {t: [name for name in asked if name.startswith(f"{t}.")] for t in sorted(topics) if t not in cameras}
         used = [*cameras, *(topic for topic in fields if fields[topic])]
         found: dict[str, list[tuple[float, Any]]] = {topic: [] for topic in used}

@@ -8,6 +8,7 @@
 Finished runs are skipped, interrupted ones resumed. A run that diverged (failed.json) is named below the table.
 """
 
+import re
 import statistics
 from collections.abc import Sequence
 from dataclasses import replace
@@ -51,7 +52,10 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str
         try:
             own, key = _check_row(plan, row, pack)
         except ValueError as error:
-            left_out[row.label] = str(error)
+            # It names options of pretrain; those of data are compare's, too.
+            found = re.split(r"--(?!data)(\S+) (?=\d)", str(error))
+            found[1::2] = [f"--set {option.replace('-', '_')}=" for option in found[1::2]]
+            left_out[row.label] = "".join(found)
             continue
         if key in seen:
             left_out[row.label] = f"the same run as {seen[key]!r} under recipe {plan.recipe!r}"

@@ -6,6 +6,7 @@ Shapes: O filters, C channels, h x w pixels of a kernel.
 import argparse
 import hashlib
 import sys
+import warnings
 from collections.abc import Collection, Iterable
 from functools import cache, partial
 from pathlib import Path
@@ -72,10 +73,12 @@ def read_tensors(file: Path) -> State:
     if file.suffix == ".safetensors":
         return read_safetensors(file)[1]
     try:
-        with torch.serialization.safe_globals([argparse.Namespace]):  # several owners keep their options in the file
+        # Several owners keep their options in the file. torch warns of TorchScript.
+        with torch.serialization.safe_globals([argparse.Namespace]), warnings.catch_warnings(action="ignore"):
             found = _flat(torch.load(file, map_location="cpu", weights_only=True))
-    except Exception as error:  # torch raises several types
-        raise ValueError(f"{file} cannot be read as weights without running code from it ({brief(error)})") from None
+    except Exception:  # torch raises several types
+        why = "is damaged, or cannot be read without running code from it: a state_dict is read, or .safetensors"
+        raise ValueError(f"{file} {why}") from None
     if not found:
         raise ValueError(f"{file} holds no named weights")
     return found

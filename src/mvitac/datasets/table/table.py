@@ -24,7 +24,7 @@ from mvitac.datasets.table import clocks, columns, images, splits
 from mvitac.datasets.table.columns import Condition, all_hold, value_task
 from mvitac.datasets.table.image_refs import span_of
 from mvitac.datasets.table.images import Background, Row, bundles, read_rows
-from mvitac.datasets.table.manifest import Manifest
+from mvitac.datasets.table.manifest import READERS, Manifest
 from mvitac.datasets.table.splits import BY_GROUP
 from mvitac.registry import check_range, to_json, unknown
 from mvitac.system.files import parse_json
@@ -152,7 +152,9 @@ class RowsConfig(DatasetConfig, ABC):
                 pixels = listed.replace(":", "").isdecimal() and all(numbers[2:])
                 if not good or not (numbers[0] < numbers[1] if many == 2 else pixels):
                     raise ValueError(f"{text!r}: write COLUMN={'x:y:width:height' if many == 4 else 'LOW:HIGH'}")
-                looks.setdefault(column, {})[name] = tuple(map(int, numbers) if many == 4 else numbers)
+                if name in looks.setdefault(column, {}):
+                    raise ValueError(f"{text!r}: {column} has another before it, give one")
+                looks[column][name] = tuple(map(int, numbers) if many == 4 else numbers)
         return looks
 
     def conditioned(self) -> list[str]:
@@ -201,6 +203,7 @@ class Rows(Source):
         self._images = tuple(column for column in (self._vision, *self._touch) if column)
         self._group = config.group or ("group" if "group" in table.columns else table.group)
         self._split = config.split or ("split" if "split" in table.columns else BY_GROUP)
+        self._check_used(table)
         self._sensor = config.sensor or ("sensor" if "sensor" in table.columns else None)
         label_columns = config.labels or table.labels
         value_tasks = [value_task(text) for text in config.values]
@@ -247,6 +250,19 @@ class Rows(Source):
             crop={m: ", ".join(cuts[c] for c in own if c in cuts) for m, own in asked.items() if {*own} & {*cuts}},
         )
         parse_json(json.dumps([to_json(self._spec), [*{*groups}]], ensure_ascii=False))  # or no result could be read
+
+    def _check_used(self, table: Manifest) -> None:
+        """ValueError for an option that changes nothing of this table."""
+        config, listed = self._config, table.path.suffix.lower() in READERS
+        idle: dict[str, Any] = {"pictures": listed and "the table names its images"}
+        idle |= dict.fromkeys(
+            ("tolerance", "interpolate"), listed and not config.log and "--data.log names no other clock"
+        )
+        given = self._split != BY_GROUP and f"column {self._split!r} says the split"
+        idle |= dict.fromkeys(("test_share", "val_share", "split_seed"), given)
+        for name, why in idle.items():
+            if why and getattr(config, name, None) != getattr(type(config), name, None):
+                raise ValueError(f"--data.{name.replace('_', '-')} has no effect, {why}: leave it out")
 
     def _groups(self, table: Manifest) -> tuple[str, list[str], list[str]]:
         """Return what groups the rows, and each row's group and touch group."""

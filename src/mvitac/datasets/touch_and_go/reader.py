@@ -239,7 +239,7 @@ def read_frames(place: Path, numbers: list[int], size: int, lost: dict[int, str]
     if place.suffix:
         why: dict[int, str] = {}
         found = dict(video.frames(place, numbers, size, lost=why))
-        lost.update({number: f"{place.name}: frame {reason}" for number, reason in why.items()})
+        lost.update({number: f"{place.name}: frame {number} {reason}" for number, reason in why.items()})
         return found
     found = {}
     for number in numbers:
