@@ -21,7 +21,7 @@ from mvitac.methods.base import Method
 from mvitac.nn.encoders import num_features, timm_trunk
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.nn.weights import misfit, read_model, safetensors_digest, write_model
-from mvitac.registry import from_json, to_json, unknown
+from mvitac.registry import check_known, from_json, to_json
 from mvitac.run import Run, load_run
 from mvitac.system.files import brief, digest, parse_json
 from mvitac.system.sealed_folder import ARTIFACT
@@ -319,8 +319,7 @@ def tensors_of(network: nn.Module) -> dict[str, Tensor]:
 
 def weights_file(folder: Path, which: Which) -> Path:
     """The file of a run's weights; ValueError if the best ones were not kept."""
-    if which not in get_args(Which):
-        raise unknown("weights", which, get_args(Which))
+    check_known("weights", [which], get_args(Which))
     if which == "best" and not (folder / BEST).is_file():
         raise ValueError(f"{folder} has no {BEST}: train with --eval-every N to keep the best weights, or use the last")
     return folder / (BEST if which == "best" else "model.safetensors")

@@ -243,7 +243,7 @@ def test_a_network_larger_than_the_machine_is_not_made(copy: Path, monkeypatch: 
 
 
 FILES = {
-    "artifact": ("model.safetensors", "run.json", "artifact.json"),
+    "artifact": ("model.safetensors", "run.json", "artifact.json", "trained_on.safetensors"),
     "onnx": ("model.onnx", "check.safetensors", "export.json"),
 }
 

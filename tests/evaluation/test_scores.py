@@ -8,7 +8,7 @@ import torch
 from benchmarks.calibration import rates_of_error, value_rates_of_error
 from scipy.stats import t as student
 from sklearn.linear_model import Ridge
-from sklearn.metrics import confusion_matrix, f1_score, precision_score, recall_score
+from sklearn.metrics import confusion_matrix, f1_score, precision_score, recall_score, roc_auc_score
 
 from mvitac.evaluation import diagnostics as d
 from mvitac.evaluation import score_text
@@ -62,6 +62,9 @@ def test_scores_of_one_probe_are_scikit_learns() -> None:
     assert found["accuracy"] == (y == answers).mean()
     assert found["balanced_accuracy"] == pytest.approx(np.mean([(answers[y == k] == k).mean() for k in (0, 1, 3)]))
     assert found["class_groups"] == [len({i // 4 for i in np.flatnonzero(y == k)}) for k in range(5)]
+    p = rng.random(40)
+    two = score((y == 1).astype(int), np.stack([1 - p, p], 1), np.arange(40) // 4, 2)
+    assert found["auroc"] is None and two["auroc"] == roc_auc_score(y == 1, p)
 
 
 def told(source: str, seed: int | None, y: np.ndarray, answers: np.ndarray, modality: str = "both") -> dict:

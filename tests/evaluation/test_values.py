@@ -115,17 +115,6 @@ def test_a_feature_that_one_row_has_does_not_predict_metres() -> None:
     assert np.allclose(x.clip(*predict.bounds) @ weights.T + bias, predict(x))
 
 
-def test_a_single_row_far_outside_does_not_decide_r2() -> None:
-    """A feature with a small range in the fitted rows, which is not constant in more of them than in others."""
-    rng = np.random.default_rng(0)
-    x = rng.normal(size=(1300, 40))
-    y = x[:, :1] + rng.normal(0, 0.5, (1300, 1))
-    x[1100, 5] = 1721  # standard deviations
-    predict, _ = fit_ridge(x[:1000], y[:1000], 200)
-    usual = np.delete(np.arange(1000, 1300), 100)
-    assert r2_score(y[1000:], predict(x[1000:])) > r2_score(y[usual], predict(x[usual])) - 0.02 > 0.7
-
-
 def test_features_that_few_rows_have_are_worth_what_plain_ridge_makes_of_them() -> None:
     rng = np.random.default_rng(0)
     x = rng.random((6000, 10)) * (rng.random((6000, 10)) < 0.002)  # a contact in two of a thousand rows each

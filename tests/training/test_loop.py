@@ -1,10 +1,7 @@
 """The loop: resumed = straight bit for bit, batches without near-duplicates, a loss that stops when it is no number."""
 
 import os
-import random
 import shutil
-import signal
-import time
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
@@ -137,31 +133,6 @@ def test_a_folder_that_is_deleted_during_training_is_an_error(pack: Pack, tmp_pa
     with pytest.raises(ValueError, match=r"run\.json is gone: .* was deleted or moved during training"):
         train(smoke(pack, checkpoint_every=2), tmp_path / "r", quiet=True, loggers=(delete,))
     assert not list(tmp_path.iterdir())
-
-
-def command(pack: Pack, out: Path) -> list[str]:
-    fields = ["--checkpoint-every", "1", "--eval-every", "0", "--quiet"]
-    choice = ["--recipe", "smoke", "--data", "pack", "--data.path", str(pack.path)]
-    return ["pretrain", *choice, *fields, "--out", str(out), "--resume"]
-
-
-@pytest.mark.slow
-def test_sigkill_at_random_moments(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
-    """Killed with SIGKILL twice at random steps, then resumed: the weights of the run that was not."""
-    out, rng, killed = tmp_path / "killed", random.Random(), 0
-    for goal in sorted(rng.sample(range(1, 7), 2)):
-        process = begin(main, command(pack, out))
-        while process.is_alive():
-            log = out / "log.jsonl"
-            if log.exists() and len(log.read_text().splitlines()) >= goal:
-                time.sleep(rng.random() * 0.02)  # anywhere within a step or its checkpoint
-                process.kill()
-                process.join()
-                killed += process.exitcode == -signal.SIGKILL
-            time.sleep(0.002)
-    finish(begin(main, command(pack, out)))
-    assert killed == 2
-    assert_equal_weights(smoke_run, out)
 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:

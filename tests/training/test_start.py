@@ -25,10 +25,9 @@ from mvitac.nn.weights import _say, adapt_stem
 from mvitac.run import Run, load_run
 from mvitac.training.loop import train
 from mvitac.training.start import describe, load_start, load_trunk, read_start
+from support.small_methods import TINY
 from support.toy import toy_pack
 from support.training_runs import assert_equal_weights, power_cut, smoke, weights
-
-TINY = Encoders.both(trunk="mvitac_tiny", weights="scratch")
 
 
 def started(pack: Pack, init: Init, **changes: object) -> tuple[Run, torch.nn.Module, dict[str, list[str]]]:

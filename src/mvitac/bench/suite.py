@@ -112,7 +112,6 @@ class Suite:
         return value
 
     def digest(self) -> str:
-        """Digest of the definition."""
         return digest(self.definition())
 
 

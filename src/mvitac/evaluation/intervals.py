@@ -78,9 +78,8 @@ def paired_difference(
     paired = [r["seed"] for r in ours] == [r["seed"] for r in theirs]
     seeds = _over_seeds(a - b, sizes) if paired else _over_seeds(a, sizes) + _over_seeds(b, sizes)
     groups = _over_groups(a.mean(0) - b.mean(0), sizes)
-    margin = _margin_beside_0(mean, groups, seeds, len(sizes))
-    p = None if one_seed else max(_p(mean, groups + seeds), _p(mean, seeds) if seeds.value else 0, least_p(len(sizes)))
-    return mean, max(-most, mean - margin), min(most, mean + margin), p
+    margin, p = _margin_and_p(mean, groups, seeds, len(sizes))
+    return mean, max(-most, mean - margin), min(most, mean + margin), None if one_seed else p
 
 
 def mean_interval(values: np.ndarray) -> tuple[float, float, float, float]:
@@ -89,8 +88,7 @@ def mean_interval(values: np.ndarray) -> tuple[float, float, float, float]:
         return float(values.mean()), -math.inf, math.inf, 1.0
     sizes, mean = np.ones(values.shape[1]), float(values.mean())
     groups, seeds = _over_groups(values.mean(0), sizes), _over_seeds(values, sizes)
-    margin = _margin_beside_0(mean, groups, seeds, len(sizes))
-    p = max(_p(mean, groups + seeds), _p(mean, seeds) if seeds.value else 0, least_p(values.shape[1]))
+    margin, p = _margin_and_p(mean, groups, seeds, len(sizes))
     return mean, mean - margin, mean + margin, p
 
 
@@ -192,12 +190,13 @@ def _margin(groups: _Variance, seeds: _Variance) -> float:
     return max(float(stdtrit(v.freedom, 0.975)) * v.value**0.5 for v in (groups + seeds, seeds))
 
 
-def _margin_beside_0(mean: float, groups: _Variance, seeds: _Variance, num_groups: int) -> float:
-    """``_margin`` of a mean that 0 is compared with: where p is always above .05, the interval has 0 in it.
+def _margin_and_p(mean: float, groups: _Variance, seeds: _Variance, num_groups: int) -> tuple[float, float]:
+    """``_margin`` and p of a mean that 0 is compared with: where p is always above .05, the interval has 0 in it.
 
     Two groups of equal gaps would otherwise give an interval of no width.
     """
-    return max(_margin(groups, seeds), abs(mean) if least_p(num_groups) > 0.05 else 0)
+    p = max(_p(mean, groups + seeds), _p(mean, seeds) if seeds.value else 0, least_p(num_groups))
+    return max(_margin(groups, seeds), abs(mean) if least_p(num_groups) > 0.05 else 0), p
 
 
 def _p(mean: float, variance: _Variance) -> float:

@@ -5,6 +5,7 @@ Nothing is chosen on test rows: regularisation is chosen on split val, or on gro
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -179,10 +180,7 @@ def probe_model(
     modalities = [m for m in modalities if set(names_in(m, pack)) <= set(model.encoders)]  # supervised: maybe one
     if not modalities:
         return []
-
-    def source(modality: str, rows: np.ndarray) -> np.ndarray:
-        return touch_features(model, pack, modality, rows, standardise)
-
+    source = partial(touch_features, model, pack, standardise=standardise)
     records = probe_all(source, pack, tasks, modalities, probes, model.seed, fitted)
     return records + own_heads(model, pack, tasks, modalities)
 

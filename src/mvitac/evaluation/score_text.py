@@ -98,13 +98,9 @@ def headline(task: dict[str, Any], source: str, methods: Sequence[str]) -> tuple
     """The modality to show of a task's summary (both, or the best of ``source``), its score and controls beside it."""
     have = [m for m in columns_of(task) if source in task[m]]
     modality = "both" if "both" in have else max(have, key=lambda m: task[m][source]["mean"])
-    return modality, task[modality][source], beside(task, modality, methods)
-
-
-def beside(task: dict[str, Any], modality: str, methods: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """The controls of one task's summary at ``modality``."""
     found = {**task.get("none", {}), **task[modality]}
-    return {source: found[source] for source in sources_of(task) if source in found and source not in methods}
+    controls = {name: found[name] for name in sources_of(task) if name in found and name not in methods}
+    return modality, task[modality][source], controls
 
 
 def above(own: dict[str, Any], controls: dict[str, dict[str, Any]]) -> str:

@@ -135,9 +135,8 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
 
 def _scores(job: Job) -> tuple[Records, Records]:
     scores = read_json(job.out / "scores.json", "a run's scores")
-    records = scores["records"]
     method = job.run.method.name
-    named = [{**record, "source": job.label + record["source"].removeprefix(method)} for record in records]
+    named = [{**r, "source": job.label + r["source"].removeprefix(method)} for r in scores["records"]]
     return named, [{**found, "source": job.label} for found in scores["retrieval"]]
 
 

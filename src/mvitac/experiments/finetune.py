@@ -223,7 +223,6 @@ class _Job:
         return split_rows(self.pack, task, self.modality).test
 
     def named(self, found: Records, kind: str, percent: float, seed: int, learned: list[Source] | None) -> Records:
-        """Records with their source and leaks."""
         rows, scored = {task.name: self.test(task) for task in self.tasks}, Scored(self.pack)
         known = {"source": kind, "seed": seed, "fraction": percent}
         return [{**known, **record, "leak": scored.leak(learned, rows[record["task"]])} for record in found]

@@ -56,7 +56,6 @@ class Job:
         return (found["asked"], found.get("of")) == (self.asked, self.run.digest())
 
     def seconds(self) -> float:
-        """Seconds of training."""
         return seconds_of(read_log(self.out), self.run.batch_size)
 
 

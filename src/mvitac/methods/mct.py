@@ -26,7 +26,7 @@ from mvitac.nn.encoders import Encoders
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Queue
 
-HEADS = [(modality, head) for modality in ("vision", "touch") for head in ("intra", "inter")]  # each has a queue
+HEADS = [(modality, head) for modality in ("vision", "touch") for head in ("intra", "inter")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,7 @@ class MCT(MViTac):
         same = ("temperature", "lambda_inter", "momentum", "out", "hidden", "head_norm")
         super().__init__(MViTacConfig(**{name: getattr(config, name) for name in same}), spec, encoder)
         self.mct, self.queues = config, nn.ModuleDict()
-        self.pending: dict[tuple[str, str], Tensor] = {}
+        self.pending: dict[str, Tensor] = {}
 
     def prepare(self, rows: Tensor) -> None:
         size = self.mct.queue_size(len(rows))
@@ -73,17 +73,15 @@ class MCT(MViTac):
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         assert self.queues, "call prepare(rows) first"
         losses, tau, margin = {}, self.mct.temperature, self.mct.margin
-        self.pending = {(m, head): z["k", m, 1, head] for m, head in HEADS}
+        self.pending = {f"{m}_{head}": z["k", m, 1, head] for m, head in HEADS}
+        queues: dict[str, Tensor] = {name: queue.keys for name, queue in self.queues.items()}  # type: ignore[misc]
         for part, (x, y) in PARTS.items():
             head = "intra" if x == y else "inter"
-            query, key, queue = z["q", x, 0, head], z["k", y, 1, head], self.queue(y, head).keys
+            query, key, queue = z["q", x, 0, head], z["k", y, 1, head], queues[f"{y}_{head}"]
             losses[part] = queue_nce(query, key, queue, tau) if x == y else hinge(query, key, queue, margin)
         return {"loss": losses["vv"] + losses["tt"] + self.mct.lambda_inter * (losses["vt"] + losses["tv"]), **losses}
 
-    def queue(self, modality: str, head: str) -> Queue:
-        return self.queues[f"{modality}_{head}"]  # type: ignore[return-value]
-
     def after_step(self, progress: float) -> None:
-        for (modality, head), keys in self.pending.items():
-            self.queue(modality, head).push(keys)
+        for name, keys in self.pending.items():
+            self.queues[name].push(keys)  # type: ignore[operator]
         super().after_step(progress)

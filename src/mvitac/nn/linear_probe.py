@@ -15,8 +15,6 @@ from mvitac.data.spec import Target
 
 @dataclass(frozen=True, kw_only=True)
 class _Asked:
-    """Task and modality of a probe."""
-
     task: str
     modality: str  # touch, vision or both
 

@@ -50,7 +50,6 @@ class Study:
         return list(dict.fromkeys(run.source for run in self.runs))
 
     def hue(self, run: Finished) -> str:
-        """The colour of a run's method."""
         return HUES[self.sources.index(run.source) % len(HUES)]
 
     def rows(self) -> tuple[str, np.ndarray]:

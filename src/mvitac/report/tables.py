@@ -9,12 +9,10 @@ from tabulate import tabulate
 from mvitac.evaluation import score_text
 from mvitac.evaluation.intervals import MIN_GROUPS, interval, num_groups_of, paired_difference
 from mvitac.evaluation.leaks import leak_mark
-from mvitac.evaluation.probe import VALUE_PROBES
 from mvitac.evaluation.score_text import columns_of, error_text, headline, percent, sources_of, with_interval
 from mvitac.evaluation.scores import grouped, leaks_in
 
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
-VALUE_PROBE_NAMES = {"linear": "ridge regression"}
 NUM_BESIDE = 3  # sources side by side in a table of classes
 RETRIEVAL = ("R@1", "R@5", "R@10", "chance R@5")  # columns of a retrieval table, in percent
 
@@ -26,9 +24,8 @@ def unseen_groups(group_by: str, records: Sequence[dict[str, Any]]) -> str:
 
 def probe_name(kind: str, score: str) -> str:
     """The name of probe ``kind`` for a task with ``score`` (``scores.score_name``)."""
-    if score == "R2":  # by_cell shows another probe where values have none of this kind
-        kind = "linear" if kind in PROBE_NAMES and kind not in VALUE_PROBES else kind
-        return VALUE_PROBE_NAMES.get(kind) or PROBE_NAMES.get(kind, kind)
+    if score == "R2" and kind in ("linear", "paper"):  # values have no probe of the paper: by_cell shows the linear one
+        return "ridge regression"
     return PROBE_NAMES.get(kind, kind)
 
 

@@ -83,7 +83,7 @@ def grasp(
         touch_rng, view_rng = (np.random.default_rng([tag, *key, order]) for tag in (_TOUCH, _VIEW))
         row: dict[str, Any] = {"phase": moment.phase, **known}
         for side, name, touch in ((0, "left", moment.left), (1, "right", moment.right)):
-            imprint, contacts = _pressed(bench, patch, moment, side, max(GRID, size), measured)
+            imprint, contacts = _pressed(bench, patch, touch, side, max(GRID, size), measured)
             copy: Any = {"unit": units[side], "gain": gain, "pixel_mm": FIELD_MM / len(imprint)}
             x, y = (SHEAR_LIMIT_MM * float(np.tanh(n * SHEAR_MM_PER_N / SHEAR_LIMIT_MM)) for n in touch.shear_n)
             row[f"touch_{name}"] = gel.render(imprint, sensor, touch_rng, shear_mm=(x, y), size=size, **copy)
@@ -119,13 +119,12 @@ def _latents(thing: objects.Thing, patch: skin.Patch, plan: physics.Plan) -> dic
 
 
 def _pressed(
-    bench: physics.Bench, patch: skin.Patch, moment: physics.Moment, side: int, grid: int, measured: bool
+    bench: physics.Bench, patch: skin.Patch, touch: physics.Touch, side: int, grid: int, measured: bool
 ) -> tuple[np.ndarray, dict[str, float]]:
     """Return the imprint [grid, grid] in mm of the object in one gel, seen from behind the gel; row 0 is up.
 
     If ``measured``, also return what physics knows of the contact: depth_mm, shear_x_n, ...
     """
-    touch = (moment.left, moment.right)[side]
     pixel, pressed = FIELD_MM / grid, np.zeros((grid, grid), np.float32)
     if touch.normal_n > 0 and (relief := _relief(bench, patch, side, grid)) is not None:
         spring = {"stiffness": bench.thing.stiffness, "pixel_mm": pixel, "dome_radius_mm": objects.DOME_RADIUS_MM}

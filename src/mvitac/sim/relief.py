@@ -201,7 +201,6 @@ class Relief:
     tables: F  # random numbers [4, 64, 64] of this instance
 
     def __call__(self, x: F, y: F) -> F:
-        """Return heights [H, W]."""
         wave = np.float32(self.wavelength_mm)
         u, v = x / (wave * np.float32(self.anisotropy)), y / wave
         bend = np.float32(0.45 * self.irregularity)

@@ -61,7 +61,6 @@ class World:
         return bool(value > 0)
 
     def barrier(self) -> None:
-        """Wait until all processes have called this."""
         if self.size > 1:
             dist.barrier()
 

@@ -110,7 +110,7 @@ def _record(setup: Setup, asked: Run, out: Path, start: Start | None, taken: dic
         if start:
             record["start"] = taken
             said.append(describe_start(taken))
-        found = warning(run, start, pack)
+        found = warning(run, start, before, pack)
         for line in [*(said if not quiet else ()), *([f"warning: {found}"] if found else ())]:
             print(f"mvitac: {line}", file=sys.stderr)
         write_json(out / "run.json", {**record, **provenance()}, sealed=True)

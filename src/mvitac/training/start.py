@@ -97,9 +97,8 @@ def describe(record: dict[str, Any]) -> str:
     return f"starts from {record['name']} (sha256 {record['digest'][:12]}): {', '.join(parts)}"
 
 
-def warning(run: Run, start: Start | None, pack: Pack) -> str:
-    """A line on rows of split test that start weights were trained on, or may have been; "" if there are none."""
-    sources = [*(start.sources if start else []), *map(leaks.file_source, leaks.weights_files(run))]
+def warning(run: Run, start: Start | None, sources: list[leaks.Source], pack: Pack) -> str:
+    """A line on rows of split test that start weights were trained on (``sources``), or may have been; "" if none."""
     if not sources:
         return ""
     tested = [pack.rows("test", only=task.only, by=task.split) for task in pack.spec.all_tasks] or [pack.rows("test")]

@@ -81,8 +81,6 @@ def validate(
 
 @torch.no_grad()
 def _validate(model: Model, pack: Pack, run: Run, locked: Mapping[str, Tensor]) -> tuple[dict[str, float], Cells]:
-    """Scores and errors on ``pack`` alone."""
-
     def read(m: str, rows: np.ndarray) -> Tensor:
         return locked[m][rows].cpu() if m in locked else pack_features(model, pack, m, rows, bf16=run.bf16)
 
