@@ -19,6 +19,7 @@ from mvitac.methods.mvitac import MViTacConfig
 from mvitac.recipes import RECIPES, recipe
 from mvitac.registry import find, to_json
 from mvitac.run import Run, load_run
+from support.toy import with_columns
 
 
 def test_paper_constants() -> None:
@@ -123,7 +124,5 @@ def test_grasps_have_the_recipe_of_the_simulator_however_they_are_read(
 def test_rows_with_other_phases_are_no_grasps(pack: Pack) -> None:
     """Only the moments of a grasp count, whatever a table calls a phase."""
     for values, phased in ((["before", "during"], True), (["during", "during"], True), (["pressed", "during"], False)):
-        other = Pack(pack.path)
-        other.table = pack.table.append_column("phase", pa.array(values * (pack.num // 2)))
-        assert other.phased is phased
+        assert with_columns(pack, phase=values * (pack.num // 2)).phased is phased
     assert not pack.phased

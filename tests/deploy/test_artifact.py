@@ -1,6 +1,5 @@
 """What is published is what is loaded; anything else in its place is refused before it can do harm."""
 
-from copy import copy as copied
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -82,8 +81,7 @@ def test_difference_images_are_told(smoke_run: Path, pack: Pack, tmp_path: Path)
     assert found.spec.difference and given["difference"] and given["background"].startswith("subtracted: touch is")
     with pytest.raises(ValueError, match="the model was trained on difference images"):
         fitting(found, pack)
-    minus = copied(pack)
-    minus.spec = replace(pack.spec, difference=True)
+    minus = with_columns(pack, spec=replace(pack.spec, difference=True))
     assert fitting(found, minus) == ("vision", "touch")
     for pair in ((mvitac.load(smoke_run), minus), (found, pack)):
         with pytest.raises(ValueError, match="difference images"):

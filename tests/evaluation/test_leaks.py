@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -49,7 +48,7 @@ from mvitac.report.report import write_report
 from mvitac.report.tables import unseen_groups
 from mvitac.system.files import read_json
 from mvitac.training.loop import train
-from support.toy import Toy
+from support.toy import Toy, with_columns
 from support.training_runs import smoke
 
 ALL = "72 of 72 test rows and 36 of 36 test instances were trained on (toy)"
@@ -125,9 +124,7 @@ def test_a_forgotten_group_is_told_below_scores(pack: Pack, tmp_path: Path, caps
 
 
 def test_a_split_that_leaks_marks_every_score(run: Path, pack: Pack) -> None:
-    own = copy(pack)
-    sides = pa.array(np.where(np.arange(pack.num) % 2 == 0, "test", "train"))
-    own.table = pack.table.set_column(pack.table.column_names.index("split"), "split", sides)
+    own = with_columns(pack, split=np.where(np.arange(pack.num) % 2 == 0, "test", "train"))
     result = probe_runs([run], ProbeConfig(tasks=("pattern",), modalities=("touch",)), own, allow_leak=True)
     assert {leak_mark(record["leak"]) for record in (*result["records"], *result["retrieval"])} == {" LEAK"}
     assert "60 of 60 test instances are also in train: this split leaks" in result["leaks"]
@@ -177,13 +174,11 @@ def test_a_list_is_that_of_its_run_and_of_its_weights(pack: Pack, tmp_path: Path
 
 def test_numbers_mean_nothing_outside_their_dataset(pack: Pack) -> None:
     """Ids of the striped pairs are numbers; those of its groups are names."""
-    elsewhere = Pack(pack.path)
-    elsewhere.spec = replace(pack.spec, name="other")
+    elsewhere = with_columns(pack, spec=replace(pack.spec, name="other"))
     nameless = replace(source_of(pack, pack.rows("train")), images=np.zeros(0, np.uint64))
     leak = Scored(elsewhere).leak([nameless], pack.rows("train"))
     assert leak.startswith(f"0 of {len(pack.rows('train'))} test rows and ")
-    again = Pack(pack.path)
-    again.spec = replace(pack.spec, name="toy (another split)")
+    again = with_columns(pack, spec=replace(pack.spec, name="toy (another split)"))
     assert Scored(again).leak([source_of(pack, pack.rows("train"))], pack.rows("train")).startswith("72 of 72 test")
 
 
@@ -263,8 +258,7 @@ def test_scores_on_val_are_not_taken_for_those_on_test(pack: Pack, tmp_path: Pat
 
 def test_numbers_of_rows_are_no_groups(pack: Pack) -> None:
     """Of two tables with ids, whose rows are their own groups, rows with one number are not the same."""
-    other = Pack(pack.path)
-    other.spec = replace(pack.spec, group_by="row")
+    other = with_columns(pack, spec=replace(pack.spec, group_by="row"))
     scored, rows = Scored(other), pack.rows("train")
     learned = source_of(other, rows)
     assert scored.leak([replace(learned, ids=np.ones(1, np.uint64), images=np.zeros(0, np.uint64))], rows) == ""

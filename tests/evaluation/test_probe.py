@@ -1,6 +1,5 @@
 """Probes and their controls: they find what is there, choose nothing on test, and count few labels honestly."""
 
-import dataclasses
 import io
 import re
 import shutil
@@ -58,12 +57,10 @@ def result(runs: list[Path]) -> dict:
     return probe_runs(runs, ProbeConfig(probes=("linear", "knn")))
 
 
-def features_that_know(pack: Pack, task_index: int, how_well: float = 3.0) -> np.ndarray:
-    """Features of the task's (train, val, test) rows in which the label is a direction plus noise."""
-    task = pack.spec.tasks[task_index]
-    rows = split_rows(pack, task)
-    everything = np.concatenate([rows.train, rows.val, rows.test])
-    labels = pack.column(f"label_{task.name}")[everything]
+def features_that_know(pack: Pack, how_well: float = 3.0) -> np.ndarray:
+    """Features of the first task's (train, val, test) rows in which the label is a direction plus noise."""
+    task = pack.spec.tasks[0]
+    labels = pack.column(f"label_{task.name}")[split_rows(pack, task).all]
     rng = np.random.default_rng(0)
     return (np.eye(8)[labels] * how_well + rng.normal(0, 0.3, (len(labels), 8))).astype(np.float32)
 
@@ -81,7 +78,7 @@ def test_the_papers_probe_learns_and_repeats() -> None:
 
 def test_linear_equals_scikit_learn(pack: Pack) -> None:
     task = pack.spec.tasks[0]
-    rows, x = split_rows(pack, task), features_that_know(pack, 0, how_well=0.4)
+    rows, x = split_rows(pack, task), features_that_know(pack, how_well=0.4)
     found = probe_features(x, pack, task, rows, "linear", 0)[0]
     labels = pack.column("label_pattern")
     num_train, num_both = len(rows.train), len(rows.train) + len(rows.val)
@@ -92,41 +89,25 @@ def test_linear_equals_scikit_learn(pack: Pack) -> None:
     assert found["accuracy"] == pytest.approx(expected, abs=1.5 / found["num_test"])  # solvers stop at different digits
 
 
-def test_nothing_is_chosen_on_test(pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_chosen_on_test(pack: Pack) -> None:
     """Shuffling the test labels changes the score but not the regularisation nor the predictions."""
     task = pack.spec.tasks[0]
-    rows, x = split_rows(pack, task), features_that_know(pack, 0, how_well=0.6)
+    rows, x = split_rows(pack, task), features_that_know(pack, how_well=0.6)
     before = probe_features(x, pack, task, rows, "linear", 0)[0]
-    real = Pack.labels
-
-    def shuffled(self: Pack, task: str, *splits: str) -> np.ndarray:
-        values = real(self, task, *splits).copy()
-        values[rows.test] = (values[rows.test] + 1) % 3
-        return values
-
-    monkeypatch.setattr(Pack, "labels", shuffled)
-    after = probe_features(x, pack, task, rows, "linear", 0)[0]
+    labels = pack.column("label_pattern").copy()
+    labels[rows.test] = (labels[rows.test] + 1) % 3
+    after = probe_features(x, with_columns(pack, label_pattern=labels), task, rows, "linear", 0)[0]
     assert after["C"] == before["C"]
     assert np.array_equal(np.roll(before["confusion"], 1, axis=0), after["confusion"])
 
 
-def test_val_is_carved_from_train_by_group_if_there_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pack = toy_pack(tmp_path / "p")
-    real = Pack.column
-
-    def without_val(self: Pack, name: str) -> np.ndarray:
-        values = real(self, name)
-        return np.where(values == "val", "train", values) if name == "split" else values
-
-    monkeypatch.setattr(Pack, "column", without_val)
-    rows = split_rows(pack, pack.spec.tasks[0])
-    groups = pack.column("group")
+def test_val_is_carved_from_train_by_group_if_there_is_none(pack: Pack) -> None:
+    split, groups = (pack.column(name).astype(str) for name in ("split", "group"))
+    without_val = with_columns(pack, split=np.where(split == "val", "train", split))
+    rows = split_rows(without_val, pack.spec.tasks[0])
     assert len(rows.val) and not set(groups[rows.val]) & set(groups[rows.train])
     assert not set(groups[rows.val]) & set(groups[rows.test])
-    monkeypatch.setattr(
-        Pack, "column", lambda *given: np.full(pack.num, "one") if given[1] == "group" else without_val(*given)
-    )
-    rows = split_rows(pack, pack.spec.tasks[0])
+    rows = split_rows(with_columns(without_val, group=np.full(pack.num, "one")), pack.spec.tasks[0])
     assert len(rows.val) and not set(rows.val) & set(rows.train), "rows of the one group"
 
 
@@ -311,9 +292,9 @@ def test_seeds_whose_automatic_precision_differs_are_seeds_of_one_run(pack: Pack
 
 def test_tasks_of_one_run_are_probed_together(pack: Pack) -> None:
     """The records are those of each task probed on its own."""
-    x = features_that_know(pack, 0)
+    x = features_that_know(pack)
     tasks = list(pack.spec.tasks)
-    order = np.concatenate([*dataclasses.astuple(split_rows(pack, tasks[0]))])
+    order = split_rows(pack, tasks[0]).all
 
     def matrix(modality: str, rows: np.ndarray) -> np.ndarray:
         return x[[int(np.flatnonzero(order == row)[0]) for row in rows]]

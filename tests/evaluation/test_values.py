@@ -21,6 +21,7 @@ from mvitac.evaluation.regressors import fit_curve, fit_ridge
 from mvitac.evaluation.scores import pool
 from mvitac.evaluation.value_scores import r2_without_each_group, score_values
 from mvitac.training.loop import train
+from support.toy import with_columns
 from support.training_runs import smoke
 
 NEWTON = (Target(name="force_n", unit="N"),)
@@ -157,9 +158,8 @@ def test_probes_of_classes_and_values_side_by_side(measured: Pack, tmp_path: Pat
 
 
 def test_packs_with_other_units_cannot_be_joined(measured: Pack) -> None:
-    other = Pack(measured.path)
-    task = replace(other.spec.values[0], targets=(Target(name="level", unit="%"),))
-    other.spec = replace(other.spec, values=(task,))
+    task = replace(measured.spec.values[0], targets=(Target(name="level", unit="%"),))
+    other = with_columns(measured, spec=replace(measured.spec, values=(task,)))
     with pytest.raises(ValueError, match=r"'light' has values level:levels in \S+, level:% in \S+: pack both alike"):
         JoinedPack(measured, other)
 

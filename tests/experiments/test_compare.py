@@ -304,8 +304,7 @@ def test_controls_are_made_again_where_the_data_names_others(
 ) -> None:
     """Of the same pixels and columns: the pack's digest is the same."""
     out = shutil.copytree(done[0], tmp_path / "out")
-    other = Pack(pack.path)
-    other.spec = replace(pack.spec, controls={"noise": ("noise",)})
+    other = with_columns(pack, spec=replace(pack.spec, controls={"noise": ("noise",)}))
     monkeypatch.setattr(collect, "controls_of", lambda *_: ([], []))
     for data, kept in ((pack, True), (other, False)):
         result = gather(lay_out(small(pack), data, out, ProbeConfig()), out, ProbeConfig())

@@ -75,8 +75,7 @@ def test_forward_is_pure(name: str) -> None:
     method = build(name)
     batch, before = views(method), copy.deepcopy(method.state_dict())
     first, second = outcome(method, batch), outcome(method, batch)
-    for key, value in first.items():
-        assert torch.equal(value, second[key]), key
+    torch.testing.assert_close(first, second, rtol=0, atol=0)
     for key, value in method.state_dict().items():
         if not any(part in key for part in ("running_", "num_batches")):
             assert torch.equal(value, before[key]), key
@@ -113,8 +112,7 @@ def test_resumed_equals_straight_and_loads(pack: Pack, tmp_path: Path, name: str
     run = replace(run, encoder=TINY_VIT) if run.method.needs_vit else run
     model = load(train_twice(run, tmp_path, cut=3, validate=False))
     checkpoints = [torch.load(tmp_path / place / "checkpoint.pt")["method"] for place in ("straight", "cut")]
-    for key, value in checkpoints[0].items():
-        assert torch.equal(value, checkpoints[1][key]), key
+    torch.testing.assert_close(*checkpoints, rtol=0, atol=0)
     assert set(model.encoders) == {"vision", "touch"}
 
 

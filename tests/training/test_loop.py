@@ -28,7 +28,7 @@ from mvitac.training.sampler import combine_seeds, draw_positives, epoch_order
 from mvitac.training.validation import validate
 from mvitac.transforms.random_views import Augment
 from support.processes import begin, finish
-from support.toy import toy_pack
+from support.toy import toy_pack, with_columns
 from support.training_runs import assert_equal_weights, batches, log_of, power_cut, smoke, stopped_at_four, views_by
 
 
@@ -215,23 +215,17 @@ def test_the_spread_sampler_spreads(pack: Pack) -> None:
     assert np.array_equal(found, rows[order[: len(found)]])
 
 
-def test_positives_are_other_rows_of_the_same_touch(pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_positives_are_other_rows_of_the_same_touch(pack: Pack) -> None:
     rows, groups = np.arange(pack.num), pack.touch_groups
     found = draw_positives(pack, rows, torch.Generator().manual_seed(0))
     assert (found != rows).all()  # every toy instance has two rows
     assert np.array_equal(groups[found], groups[rows])
     assert np.array_equal(found, draw_positives(pack, rows, torch.Generator().manual_seed(0)))
-    real = Pack.column
-
-    def halved(self: Pack, name: str) -> np.ndarray:
-        values = real(self, name)
-        if name == "split":  # one row of each group moves to test: its partner must not follow it there
-            values[groups.argsort(kind="stable")[::2]] = "test"
-        return values
-
-    monkeypatch.setattr(Pack, "column", halved)
-    rows = np.flatnonzero(real(pack, "split") != "test")  # those already in test keep their partner there
-    assert np.array_equal(draw_positives(pack, rows, torch.Generator().manual_seed(0)), rows)
+    split = pack.column("split").astype(str)
+    rows = np.flatnonzero(split != "test")  # those already in test keep their partner there
+    split[groups.argsort(kind="stable")[::2]] = "test"  # one row of each group: its partner must not follow it there
+    halved = with_columns(pack, split=split)
+    assert np.array_equal(draw_positives(halved, rows, torch.Generator().manual_seed(0)), rows)
 
 
 def asked(run: Run, pack: Pack, rows: np.ndarray, num: int = 2) -> tuple[list[int], dict[str, list[np.ndarray]]]:

@@ -41,8 +41,7 @@ def started(pack: Pack, init: Init, **changes: object) -> tuple[Run, torch.nn.Mo
 
 
 def assert_equal_states(a: torch.nn.Module, b: torch.nn.Module) -> None:
-    first, second = a.state_dict(), b.state_dict()
-    assert first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
+    torch.testing.assert_close(a.state_dict(), b.state_dict(), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("keys", ["momentum", "end-to-end"])

@@ -78,8 +78,7 @@ def test_gradient_caching_is_exact_without_batchnorm_statistics(config: MethodCo
     states, kept = (direct.state_dict(), cached.state_dict()), ("banks", "queues", "centre")
     remembered = [{k: v for k, v in state.items() if k.startswith(kept)} for state in states]
     assert (config.name in ("cmc", "moco", "mct", "dino")) == bool(remembered[0])
-    for name, value in remembered[0].items():
-        torch.testing.assert_close(value, remembered[1][name], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(*remembered, rtol=1e-4, atol=1e-5)
 
 
 def test_gradient_caching_is_exact_with_batchnorm_and_dropout_chunk_by_chunk() -> None:
@@ -96,8 +95,7 @@ def test_gradient_caching_is_exact_with_batchnorm_and_dropout_chunk_by_chunk() -
     assert_close({n: v.detach() for n, v in losses.items()}, take(RUN, cached, parts), 1e-5)
     assert_close(gradients(direct), gradients(cached), 1e-4)
     assert {int(b) for name, b in cached.query.named_buffers() if "num_batches" in name} == {3}
-    for name, buffer in direct.query.named_buffers():
-        torch.testing.assert_close(buffer, dict(cached.query.named_buffers())[name])
+    torch.testing.assert_close(dict(direct.query.named_buffers()), dict(cached.query.named_buffers()))
 
 
 def test_impossible_steps_are_named(pack: Pack, tmp_path: Path) -> None:
@@ -131,8 +129,7 @@ def test_towers_side_by_side_are_those_of_one_thread(monkeypatch: pytest.MonkeyP
     finally:
         torch.set_num_threads(before)
     assert calls == [2, 2] * 3  # forward and backward of each step, of the second training alone
-    for name, weights in one.items():
-        assert torch.equal(weights, two[name]), name
+    torch.testing.assert_close(one, two, rtol=0, atol=0)
     assert draws_random_numbers(build()) and not draws_random_numbers(build(run))  # with dropout they are not
 
 
