@@ -110,6 +110,13 @@ def test_all_pairs_are_the_mean_over_four_pairs_of_views() -> None:
 
 
 @pytest.mark.parametrize("keys", ["momentum", "end-to-end"])
+def test_touch_alone_keeps_its_intra_loss(keys: str) -> None:
+    method: Any = build("mvitac", Toy(vision_channels=0).spec(), replace(CONFIG, keys=keys))  # type: ignore[arg-type]
+    out = method(views(method, vision=0))
+    assert set(out) == {"loss", "tt"} and torch.equal(out["loss"], out["tt"])
+
+
+@pytest.mark.parametrize("keys", ["momentum", "end-to-end"])
 def test_the_loss_between_sensors_written_out(keys: str) -> None:
     """One more term beside eq. 14: touch view 0 and view 2, the same press through another sensor, by the intra heads."""
     plain, method = (built(keys=keys, lambda_sensor=weight) for weight in (0.0, 0.3))

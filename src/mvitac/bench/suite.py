@@ -112,6 +112,7 @@ class Suite:
         return value
 
     def digest(self) -> str:
+        """Digest of the definition."""
         return digest(self.definition())
 
 

@@ -26,6 +26,7 @@ class Line:
 
 
 def plan_of(result: dict[str, Any]) -> Plan:
+    """The plan of a result."""
     return from_json(Plan, result["plan"], "plan")
 
 
