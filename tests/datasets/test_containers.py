@@ -3,6 +3,7 @@
 import io
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,12 @@ def test_lerobot_of_version_2_has_a_file_per_episode(tmp_path: Path) -> None:
         rows = [{"timestamp": i / 10, "frame_index": i, "index": 8 * e + i, "force": i / 2, **known} for i in range(8)]
         (root / f"data/{chunk}").mkdir(parents=True, exist_ok=True)
         pq.write_table(pa.Table.from_pylist(rows), root / f"data/{chunk}/{name}.parquet")
-    pack = packed(LeRobotConfig(path=root, size=16, labels=("task",), values=("force:N",)), tmp_path / "pack")
+    config = LeRobotConfig(path=root, size=16, labels=("task",), values=("force:N",))
+    by_task = packed(
+        replace(config, group="task", labels=(), values=()), tmp_path / "by-task"
+    )  # a window never crosses episodes
+    assert len({*by_task.column("group")}) == 2 and len({*by_task.column("touch_group")}) == 4
+    pack = packed(config, tmp_path / "pack")
     episode, frame = pack.column("episode").astype(int), pack.column("frame").astype(int)
     assert pack.num == 32 and (pack.values(pack.spec.values[0])[:, 0] == frame / 2).all()
     named = [pack.spec.tasks[0].classes[k] for k in pack.column("label_task")]

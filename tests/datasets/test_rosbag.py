@@ -1,5 +1,6 @@
 """ROS bags, written by rosbags itself: image and wrench topics joined by time."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,8 @@ def test_topics_are_joined_by_the_time_in_their_headers(tmp_path: Path, plugin: 
     for number in range(3):
         write_bag(tmp_path / f"bags/grasp.{number}", plugin, number)
     options: dict[str, Any] = {"touch": (GEL,), "vision": FRONT, "values": (f"{WRENCH}.wrench.force.z:N",), "size": 16}
-    pack = packed(RosbagConfig(path=tmp_path / "bags", every=1, tolerance=0.045, **options), tmp_path / "pack")
+    config = RosbagConfig(path=tmp_path / "bags", every=1, tolerance=0.045, **options)
+    pack = packed(config, tmp_path / "pack")
     time, which = pack.column("time").astype(float) - START, pack.column("recording")
     assert set(which) == {"grasp.0", "grasp.1", "grasp.2"} and pack.spec.group_by == "recording"
     assert np.allclose(pack.values(pack.spec.values[0])[:, 0], 3 * time, atol=1e-5)
@@ -65,6 +67,8 @@ def test_topics_are_joined_by_the_time_in_their_headers(tmp_path: Path, plugin: 
     seen = pack.images["vision"][:, 0, 0, 0] / 100 + 0.004
     assert (abs(seen - time) <= 0.0451).all() and (pack.column("frame").astype(int) == np.round(25 * time)).all()
     assert pack.num == 3 * 48 and "6 images without all others left out" in pack.spec.notes[0]
+    one = packed(replace(config, group=f"{WRENCH}.wrench.force.y", values=()), tmp_path / "one")
+    assert {*one.column("group")} == {"1.0"} and {*one.column("touch_group")} == {f"1.0/grasp.{k}" for k in range(3)}
     few = packed(RosbagConfig(path=tmp_path / "bags/grasp.1", touch=(GEL,)), tmp_path / "few")
     assert few.images["touch"][:, 0, 0, 2].tolist() == list(range(0, 250, 25))
 

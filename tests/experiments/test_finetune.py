@@ -241,6 +241,8 @@ def test_what_was_tried_on_other_labels_is_tried_again(ancestor: Path, pack: Pac
     edited(pack, changing.path, label_pattern=lambda row: (row["label_pattern"] + 2) % 3)
     with pytest.raises(ValueError, match="seed0 holds a different run"):
         tune(ancestor, Pack(changing.path), out, asked, resume=True)
+    with pytest.raises(ValueError, match="seed0 holds a different run"):
+        tune(ancestor, Pack(changing.path), out, replace(asked, lr=(7e-3, 8e-3)), resume=True)
     assert read_json(out / "choice.json", "") == tried  # at once
 
 

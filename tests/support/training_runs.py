@@ -83,11 +83,11 @@ def train_twice(run: Run, folder: Path, *, cut: int, **options: bool) -> Path:
     return resumed
 
 
-def stopped_at_four(pack: Path, out: Path) -> None:
-    """Train in ``out`` until Ctrl-C comes in step 4, and print what is said then."""
+def stopped_at(number: int, pack: Path, out: Path) -> None:
+    """Train in ``out`` until Ctrl-C comes in step ``number``, and print what is said then."""
 
     def press(step: int, values: dict[str, float]) -> None:
-        if step == 4 and "loss" in values:  # not also at its evaluation: a second Ctrl-C stops at once
+        if step == number and "loss" in values:  # not also at its evaluation: a second Ctrl-C stops at once
             os.kill(os.getpid(), signal.SIGINT)
 
     try:

@@ -29,7 +29,7 @@ from mvitac.training.validation import validate
 from mvitac.transforms.random_views import Augment
 from support.processes import begin, finish
 from support.toy import toy_pack, with_columns
-from support.training_runs import assert_equal_weights, batches, log_of, power_cut, smoke, stopped_at_four, views_by
+from support.training_runs import assert_equal_weights, batches, log_of, power_cut, smoke, stopped_at, views_by
 
 
 def test_leaves_the_promised_files(smoke_run: Path) -> None:
@@ -135,11 +135,12 @@ def test_a_folder_that_is_deleted_during_training_is_an_error(pack: Pack, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
-def test_ctrl_c_saves_and_says_how_to_go_on(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("step", "says"), [(4, "4 of 8; {} continues with resume"), (8, "8 of 8; {} is trained")])
+def test_ctrl_c_saves_and_is_told(step: int, says: str, pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
     """In a process of its own: libraries of other tests may leave one in which no signal can be handled."""
-    finish(begin(stopped_at_four, pack.path, tmp_path / "r", output=tmp_path / "said"), tmp_path / "said")
-    assert f"after step 4 of 8; {tmp_path / 'r'} continues with resume" in (tmp_path / "said").read_text()
-    assert torch.load(tmp_path / "r" / "checkpoint.pt", weights_only=True)["step"] == 4
+    finish(begin(stopped_at, step, pack.path, tmp_path / "r", output=tmp_path / "said"), tmp_path / "said")
+    assert f"stopped after step {says.format(tmp_path / 'r')}" in (tmp_path / "said").read_text()
+    assert torch.load(tmp_path / "r" / "checkpoint.pt", weights_only=True)["step"] == step
     train(smoke(pack), tmp_path / "r", resume=True, quiet=True)
     assert_equal_weights(smoke_run, tmp_path / "r")
 

@@ -73,7 +73,7 @@ class LeRobotConfig(RecordedConfig):
         found: Refs = {}
         for column, key in names.items():
             found[column] = cells[key] if key in cells else self._in_videos(info, key, rows, episodes)
-        return Manifest.of(self.path, rows, found, notes=notes)
+        return Manifest.of(self.path, rows, found, group="episode", notes=notes)
 
     def _table(
         self, info: dict[str, Any], episodes: dict[str, dict[str, Any]], embedded: Sequence[str]

@@ -92,7 +92,7 @@ class RosbagConfig(RecordedConfig):
                     images[topic].append(Message(str(bag), topic, *at[topic][i]))
         note = f"topics are joined by time within {self.tolerance:g} s; {dropped} images without all others left out"
         stamps = (f"; {num} messages of {topic} have the stamp of another" for topic, num in (+same).items())
-        return Manifest.of(self.path, rows, images, notes=("".join([note, *stamps]),))
+        return Manifest.of(self.path, rows, images, group="recording", notes=("".join([note, *stamps]),))
 
 
 @contextmanager

@@ -261,7 +261,9 @@ def _choose(job: _Job, percent: float, kind: str) -> dict[str, Any]:
     best: dict[str, Any] = {name: values[0] for name, values in tried.items()}
     if ((path := job.folder(percent, kind) / "seed0") / "run.json").exists():  # before hours of trying
         old = load_run(path)[0]
-        check_same(job.run_of(percent, 0, kind, {"lr": old.optim.lr, "steps": old.steps}), job.pack, path)
+        last = {"lr": old.optim.lr, "steps": old.steps}
+        last = {name: last[name] if last[name] in values else values[0] for name, values in tried.items()}
+        check_same(job.run_of(percent, 0, kind, last), job.pack, path)
     if why := job.too_few(percent):
         job.say(f"{percent:g} %: {kind}: {why}: the first of --lr and --steps is used")
         return best

@@ -64,7 +64,7 @@ def train(
     Raises:
         ValueError: If the settings are impossible; where possible, before the first step.
         Diverged: If the loss or a weight is not finite.
-        Interrupted: After Ctrl-C or SIGTERM; a checkpoint is saved.
+        Interrupted: After Ctrl-C or SIGTERM; a checkpoint, or after the last step the model, is saved.
         Busy: If another process trains in ``out``.
 
     Examples:
@@ -139,7 +139,8 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
         Model(method, run, setup.spec, pack.size).save(out / "model.safetensors")
         _check_still_there(out)
         (out / checkpoint.PREVIOUS).unlink(missing_ok=True)
-    world.barrier()
+    if world.any(stop_requested()):  # since the last step was asked for; another training may follow
+        raise Interrupted(f"stopped after step {num_steps} of {num_steps}; {out} is trained")
 
 
 def _check_still_there(out: Path) -> None:

@@ -228,7 +228,7 @@ def _constants(opened: Any, name: str, vectors: Collection[str]) -> dict[str, li
         for column, value in group.attrs.items():
             plain = np.asarray(value).tolist()
             plain = plain[0] if isinstance(plain, list) and len(plain) == 1 else plain
-            plain = plain.decode() if isinstance(plain, bytes) else plain
+            plain = plain.decode(errors="replace") if isinstance(plain, bytes) else plain
             left_out = len(plain) > MAX_TEXT if isinstance(plain, str) else column not in vectors
             if isinstance(plain, (int, float)) or (isinstance(plain, (str, list)) and not left_out):
                 cells[column] = [text_of(plain)]
