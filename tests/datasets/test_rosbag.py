@@ -68,7 +68,7 @@ def test_topics_are_joined_by_the_time_in_their_headers(tmp_path: Path, plugin: 
     assert (abs(seen - time) <= 0.0451).all() and (pack.column("frame").astype(int) == np.round(25 * time)).all()
     assert pack.num == 3 * 48 and "6 images without all others left out" in pack.spec.notes[0]
     one = packed(replace(config, group=f"{WRENCH}.wrench.force.y", values=()), tmp_path / "one")
-    assert {*one.column("group")} == {"1.0"} and {*one.column("touch_group")} == {f"1.0/grasp.{k}" for k in range(3)}
+    assert {*one.column("group")} == {"1"} and {*one.column("touch_group")} == {f"1/grasp.{k}" for k in range(3)}
     few = packed(RosbagConfig(path=tmp_path / "bags/grasp.1", touch=(GEL,)), tmp_path / "few")
     assert few.images["touch"][:, 0, 0, 2].tolist() == list(range(0, 250, 25))
 
