@@ -162,6 +162,7 @@ def test_packs_with_other_units_cannot_be_joined(measured: Pack) -> None:
     other = with_columns(measured, spec=replace(measured.spec, values=(task,)))
     with pytest.raises(ValueError, match=r"'light' has values level:levels in \S+, level:% in \S+: pack both alike"):
         JoinedPack(measured, other)
+    assert [task.name for task in JoinedPack(measured, other, ["pattern"]).spec.all_tasks] == ["pattern"]
 
 
 def test_folds_are_pooled_to_the_scores_of_all_groups_together() -> None:

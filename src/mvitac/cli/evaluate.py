@@ -61,7 +61,7 @@ def probe(argv: list[str]) -> None:
         if options.config.folds:
             raise ValueError("--folds fits and scores on one pack: leave --learn-on out")
         join = RecolouredPack if "colours" in options.config.standardise else JoinedPack
-        pack = join(Pack(options.learn_on), pack)
+        pack = join(Pack(options.learn_on), pack, options.config.tasks)
     elif "colours" in options.config.standardise:
         raise ValueError("--standardise colours shows a new sensor as one of --learn-on: name that pack as well")
     with shown():

@@ -3,7 +3,7 @@
 import functools
 import itertools
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -239,14 +239,14 @@ def _kind(table: pa.Table, name: str) -> str:
 class JoinedPack(_Several):
     """Train and val rows of ``learn`` followed by test rows of ``score``.
 
-    Tasks are those that both packs have, with the classes of ``learn``. ValueError if there is none, or the packs have
-    other image shapes, classes that ``learn`` lacks, or a group or an image in both (test rows would not be unseen).
+    Tasks are those that both packs have (of ``names``), with the classes of ``learn``. ValueError if there is none, or the
+    packs have other image shapes, classes that ``learn`` lacks, or a group or an image in both.
 
     Attributes:
         learn: The first pack; its rows come first.
     """
 
-    def __init__(self, learn: Pack, score: Pack) -> None:
+    def __init__(self, learn: Pack, score: Pack, names: Collection[str] = ()) -> None:
         self.path, self.meta, self.learn, self.size = score.path, score.meta, learn, learn.size
         self.digests = {"learn": learn.digest, "score": score.digest}
         for modality in MODALITIES:
@@ -254,11 +254,11 @@ class JoinedPack(_Several):
             if any(num for _, num in shapes) and shapes[0] != shapes[1]:
                 each = [f"{num} channels at {size} px" for size, num in shapes]
                 raise ValueError(f"{modality}: {each[0]} in {learn.path}, {each[1]} in {score.path}: pack both alike")
-        tasks = _common_tasks(learn, score)
+        tasks = _common_tasks(learn, score, names)
         learned = _side(learn, tasks, "learned", {"train", "val"})
         scored = _side(score, tasks, "scored", {"test"})
-        names = [name for name in learned.column_names if name in scored.column_names]
-        self.table = pa.concat_tables([learned.select(names), scored.select(names)], promote_options="permissive")
+        shared = [name for name in learned.column_names if name in scored.column_names]
+        self.table = pa.concat_tables([learned.select(shared), scored.select(shared)], promote_options="permissive")
         theirs = score.spec.controls
         self.spec = replace(
             learn.spec,
@@ -285,12 +285,12 @@ class JoinedPack(_Several):
         return None
 
 
-def _common_tasks(learn: Pack, score: Pack) -> dict[str, AnyTask]:
-    known = {task.name: task for task in learn.spec.all_tasks}
+def _common_tasks(learn: Pack, score: Pack, names: Collection[str]) -> dict[str, AnyTask]:
+    known = {task.name: task for task in learn.spec.all_tasks if task.name in (names or (task.name,))}
     tasks = [(known[task.name], task) for task in score.spec.all_tasks if task.name in known]
     if not tasks:
-        names = [", ".join(task.name for task in pack.spec.all_tasks) or "none" for pack in (learn, score)]
-        raise ValueError(f"no task is in both packs: {learn.path} has {names[0]}, {score.path} {names[1]}")
+        both = [", ".join(task.name for task in pack.spec.all_tasks) or "none" for pack in (learn, score)]
+        raise ValueError(f"no task is in both packs: {learn.path} has {both[0]}, {score.path} {both[1]}")
     for ours, theirs in tasks:
         other = _about(theirs)
         for what, mine in _about(ours).items():

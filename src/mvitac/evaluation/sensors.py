@@ -4,7 +4,7 @@ All statistics come from images without labels. Shapes: features [N, D].
 """
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 
 import numpy as np
@@ -128,8 +128,8 @@ class RecolouredPack(JoinedPack):
     ``looks``: one pack for each known sensor (at most ``MAX_LOOKS``, those with the most rows), with its colours.
     """
 
-    def __init__(self, learn: Pack, score: Pack) -> None:
-        super().__init__(learn, score)
+    def __init__(self, learn: Pack, score: Pack, names: Collection[str] = ()) -> None:
+        super().__init__(learn, score, names)
         _check_gel(self, COLOURS)
         self.new = {n for n, name in enumerate(self.sensor_names) if name not in learn.sensor_names}
         if not self.new:
