@@ -190,7 +190,7 @@ def open_set(one: SuiteSet, root: Path | None) -> Opened | str:
         made = [_config(form, root or Path(), form.data).open()]
         if form.score_on:
             made.append(_config(form, root or Path(), {**form.data, **form.score_on}).open())
-        pack = JoinedPack(*made) if form.score_on else made[0]
+        pack = JoinedPack(made[0], made[1]) if form.score_on else made[0]
         known = {task.name: task for task in pack.spec.all_tasks}
         check_known(f"task of {one.name}", (asked.name for asked in one.tasks), known)
         tasks = tuple((asked, known[asked.name]) for asked in one.tasks)
