@@ -83,6 +83,8 @@ def test_table1_has_one_budget_and_ablation_leaves_out_what_changes_nothing(pack
     assert "'pack' has no data.difference" in work.left_out["difference images of touch"]
     digests = [job.run.digest() for job in work.jobs]
     assert len(set(digests)) == len(digests)
+    with pytest.raises(ValueError, match="'pattern' has no labelled rows in split test: nothing to probe"):
+        lay_out(small(pack), with_columns(pack, split=["train"] * pack.num), tmp_path, ProbeConfig())
     with pytest.raises(ValueError, match="batch_size is 999: give --set batch_size=72 or less"):
         lay_out(small(pack, rows=ABLATION.rows, set={"batch_size": 999}), pack, tmp_path, ProbeConfig())
 

@@ -20,6 +20,7 @@ import numpy as np
 from mvitac.data.pack import Pack
 from mvitac.evaluation.controls import Records, controls_of, frozen_trunks
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
+from mvitac.evaluation.probe import split_rows
 from mvitac.experiments.jobs import Job, Work
 from mvitac.experiments.plan import ONE_ROW, Plan, Row, slug
 from mvitac.nn.encoders import SCRATCH
@@ -39,7 +40,8 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str
     if no row is possible, or ``out`` holds other runs.
     """
     assert plan.data is not None
-    chosen(pack, session)
+    for task in chosen(pack, session)[0]:
+        split_rows(pack, task)  # before anything is trained
     session = replace(session, controls=False)
     possible: list[tuple[Row, Pack]] = []
     left_out: dict[str, str] = {}
