@@ -222,6 +222,9 @@ def test_files_that_are_no_videos(made: dict[str, Path], tmp_path: Path) -> None
         (tmp_path / name).write_bytes(data)
         with pytest.raises(ValueError, match=rf"{name} cannot be read as a video .* damaged or cut off"):
             num_frames(tmp_path / name)
+    (tmp_path / "part.mkv").write_bytes(made["h264-mkv"].read_bytes()[:-4000])
+    with pytest.raises(ValueError, match=r"part\.mkv ends after \d\.\d s of 00:00:.*: it is cut off"):
+        num_frames(tmp_path / "part.mkv")
     with pytest.raises(FileNotFoundError, match=r"gone\.mp4"):
         num_frames(tmp_path / "gone.mp4")
     with av.open(str(tmp_path / "sound.mp4"), "w") as container:

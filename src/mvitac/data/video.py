@@ -9,6 +9,7 @@ import contextlib
 import functools
 import itertools
 import os
+import re
 import sys
 from bisect import bisect_left, insort
 from collections import deque
@@ -229,6 +230,8 @@ def _read_packets(path: str, size: int, changed: int) -> Packets:
             found = [(e.timestamp, e.pos, e.is_keyframe, e.is_discard) for e in table if e.size]
         else:
             found = [(p.dts, p.pos, p.is_keyframe, p.is_discard) for p in container.demux(stream) if p.size]
+        unit = float(stream.time_base or 0)
+        told = re.fullmatch(r"(\d+):(\d+):([\d.]+)", stream.metadata.get("DURATION", ""))  # of a Matroska file
         if table is None and avi and len(found) != stream.frames:
             raise ValueError(f"{path} is damaged, and PyAV {av.__version__} cannot number its frames: use 18 or newer")
     # The first packets of a Matroska file with B-frames have no decoding time: they get one before the first known.
@@ -244,4 +247,6 @@ def _read_packets(path: str, size: int, changed: int) -> Packets:
         raise ValueError(f"{path} is put together from pieces by an edit list: encode it again, ffmpeg -i IN OUT.mp4")
     if (np.diff(dts) <= 0).any() or not len(keys):
         raise ValueError(f"{path} has frames out of order or no key frame: it is damaged, or convert it to mp4")
+    if told and dts[-1] * unit < 3600 * int(told[1]) + 60 * int(told[2]) + float(told[3]) - 1:
+        raise ValueError(f"{path} ends after {dts[-1] * unit:.1f} s of {told[0]}: it is cut off, fetch it again")
     return Packets(dts, places, keys, before)
