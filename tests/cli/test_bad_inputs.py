@@ -361,6 +361,7 @@ def test_contact_in_a_pack(refused: Callable[..., str], pack: Pack, tmp_path: Pa
         refused(
             f"predict e {pack.path} {option} --out {{out}}", "--background, --calibration and --contact are for rec"
         )
+    refused(f"predict e {pack.path} --touch gel --out {{out}}", "--touch is for recordings and tables, /")
 
 
 def test_an_option_given_twice(refused: Callable[..., str], finished: Path) -> None:

@@ -173,6 +173,8 @@ def predict(argv: list[str]) -> None:
     config: Any = None if files else dataset(options.source or "")  # what cannot be read is refused before an export
     if config and (options.background or options.live != LiveConfig()):
         raise ValueError("--background, --calibration and --contact are for recordings: leave them out")
+    for name in (m for m, texts in given.items() if texts and config and not hasattr(config, m)):
+        raise ValueError(f"--{name} is for recordings and tables, {options.source} knows its images: leave it out")
     engine = _engine(options.model, options.threads, tuple(opened), most=1 if single else 2)
     if not (engine.classes or engine.values):
         raise ValueError(f"{options.model} has no probes of classes or values: export it on data that has labels")
