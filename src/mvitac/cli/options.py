@@ -148,4 +148,5 @@ def _one_line(boxed: str, prog: str) -> str:
     text = re.sub(r"\x1b\[[0-9;]*m", "", boxed)
     lines = [line.strip(" │|") for line in text.splitlines()[1:] if not re.match(r"\s*(╰|[│|]?\s*[-─]{3,})", line)]
     text = re.split(r" (?:Argument helptext:|For full helptext)", " ".join(line for line in lines if line))[0]
-    return f"{re.sub(r'^Error parsing \w+: ', '', text)} (see mvitac {prog} --help)"
+    text = re.sub(r"^Error parsing \w+: ", "", text)  # a class of ours
+    return f"{text} (see mvitac {prog} --help)"

@@ -89,7 +89,9 @@ def class_rows(classes: Sequence[dict[str, Any]], sources: Sequence[str]) -> lis
 
 def print_classes(result: dict[str, Any], file: TextIO | None = None) -> None:
     """Print precision and recall of each class, a table per task; of several methods in several tables."""
-    for task, modality, sources, classes in classes_of(result):
+    if not (found := list(classes_of(result))):
+        print("no task that was scored has classes", file=file)
+    for task, modality, sources, classes in found:
         title = f"{task} by {score_text.WORDS[modality]}: precision / recall of each class, %"
         for start in range(0, len(sources), NUM_BESIDE):
             some = sources[start : start + NUM_BESIDE]
