@@ -37,7 +37,7 @@ def known_options() -> set[str]:
     options = {option for file in helps for option in re.findall(r"--[a-z][a-z0-9.-]*[a-z0-9]", file.read_text())}
     options |= {option.replace("--data.", "--") for option in options}  # as `mvitac data ...` spells them
     options |= {option.replace("--encoder.vision.", "--encoder.") for option in options}  # short for both modalities
-    options |= {"--items", "--max-damaged"}  # of `data check` and `data pack`, shown when a dataset is named
+    options |= {"--max-damaged"}  # of `data pack`, shown when a dataset is named
     options |= {"--tyro-print-completion"}
     for base, prefixes in ((DatasetConfig, ("--data.", "--")), (MethodConfig, ("--method.", "--method.no-"))):
         for config in base.choices.values():

@@ -45,8 +45,6 @@ class _PackOptions(_Options):
 @dataclass(frozen=True, kw_only=True)
 class _SourceOptions(_Options):
     data: Annotated[DatasetConfig, tyro.conf.arg(name="")]
-    items: int = 0
-    """Number of items to read, evenly spread over the source; 0 = all."""
     quiet: bool = False
     """No progress bar."""
 
@@ -73,8 +71,8 @@ def check(argv: list[str]) -> int:
         return _report(str(data.path), examine_pack(data.path, draw_sheet), options)
     # A leak is a finding here, beside all the others; packing refuses it.
     source = (replace(data, allow_leak=True) if isinstance(data, RowsConfig) else data).source()
-    asked: Any = {"num": options.items, "workers": data.workers, "quiet": options.quiet, "draw": draw_sheet}
-    return _report(name, examine_source(source, **asked), options)
+    findings = examine_source(source, workers=data.workers, quiet=options.quiet, draw=draw_sheet)
+    return _report(name, findings, options)
 
 
 def _sheet(what: str, options: _Options) -> Draw | None:

@@ -22,7 +22,6 @@ from mvitac.data.checks.table_checks import similar_names
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Task
-from mvitac.datasets.folder import FolderConfig
 from support.toy import altered
 
 NUM_OBJECTS, NUM_FRAMES, SIDE = 20, 16, 32
@@ -181,21 +180,6 @@ def test_classes_that_differ_in_spelling_only(pack: Pack) -> None:
         found = similar_names(other)
         assert found.verdict == ("look" if alike else "ok"), classes
         assert (f"classes of pattern: {alike}" == found.evidence) == bool(alike), found.evidence
-
-
-def test_a_part_of_a_source_proves_no_class_unseen(tmp_path: Path) -> None:
-    rows = ["touch,label,object,split"]
-    for i in range(60):
-        Image.fromarray(np.random.default_rng(i).integers(0, 255, (16, 16, 3), np.uint8)).save(tmp_path / f"{i}.png")
-        rows.append(f"{i}.png,c{i % 10},{i},{'train' if i < 40 else 'test'}")
-    (tmp_path / "m.csv").write_text("\n".join(rows))
-    source = FolderConfig(path=tmp_path / "m.csv", labels=("label",), group="object", size=16).source()
-    for num, verdict in ((0, "ok"), (12, "look")):
-        findings = examine_source(source, num=num, size=16, quiet=True)
-        assert f"{num or 60} of 60 items examined" in findings[0].evidence
-        found = {f.item: f for f in findings}["labels of label"]
-        assert found.verdict == verdict and exit_code(findings) <= ("ok", "look").index(verdict)
-    assert found.evidence.startswith("in the items examined: 10 classes") and "never seen in training" in found.evidence
 
 
 def test_a_damaged_pack_is_told_and_training_refuses_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
