@@ -30,6 +30,7 @@ from PIL import Image
 from mvitac.cli.main import main
 from mvitac.data import build as packing
 from mvitac.data.pack import Pack
+from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
 from mvitac.evaluation import probe as probe_module
@@ -362,6 +363,19 @@ def test_contact_in_a_pack(refused: Callable[..., str], pack: Pack, tmp_path: Pa
             f"predict e {pack.path} {option} --out {{out}}", "--background, --calibration and --contact are for rec"
         )
     refused(f"predict e {pack.path} --touch gel --out {{out}}", "--touch is for recordings and tables, /")
+
+
+@pytest.mark.parametrize("command", ["demo --recipe smoke", "pretrain --data folder", "pretrain --data materials"])
+def test_a_run_that_cannot_begin_makes_no_data(
+    refused: Callable[..., str], command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(DatasetConfig, "open", None)
+    for option, says in (
+        ("--init nope", "init nope does not exist: give a finished run"),
+        ("--encoder.weights nope", "weights 'nope': give imagenet, scratch, or a file that exists"),
+        ("--device nope", "device 'nope' does not exist"),
+    ):
+        refused(f"{command} {option} --out {{out}}", says)
 
 
 def test_an_option_given_twice(refused: Callable[..., str], finished: Path) -> None:

@@ -15,7 +15,7 @@ from mvitac.run import Run, load_run
 from mvitac.system.distributed import join
 from mvitac.training.log import LOGGERS, open_loggers
 from mvitac.training.loop import train
-from mvitac.training.setup import check_out, open_pack
+from mvitac.training.setup import check_out, check_start, open_pack
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +50,7 @@ def pretrain(argv: list[str]) -> None:
     options, pack = parse(_Options, rest, "pretrain", default=usual, description=description), None
     if "--from" in chosen or base.data.phased is None:
         check_out(options.out, options.resume)
+        check_start(options.run, options.out)
         pack = open_pack(options.run.data, join(), options.quiet)
     if pack and "--from" in chosen:
         known = load_run(Path(chosen["--from"]))[1].get("pack", pack.digest)

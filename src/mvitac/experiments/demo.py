@@ -12,6 +12,7 @@ from mvitac.run import Run
 from mvitac.system.files import write_json
 from mvitac.system.progress import shown
 from mvitac.training.loop import train
+from mvitac.training.setup import check_start
 
 
 def run_demo(run: Run, out: Path, num_seeds: int) -> Path:
@@ -23,6 +24,7 @@ def run_demo(run: Run, out: Path, num_seeds: int) -> Path:
     if not 1 <= num_seeds <= 1000:
         raise ValueError(f"seeds {num_seeds}: give 1 to 1000")
     start = time.perf_counter()
+    check_start(run, out / f"seed{run.seed}")
     print(f"1/4 simulating {run.data.name}: {getattr(run.data, 'num', '')} pairs, kept in the cache")
     pack = run.data.open()
     runs = [(replace(run, seed=run.seed + i), out / f"seed{run.seed + i}") for i in range(num_seeds)]

@@ -59,8 +59,7 @@ class Setup:
 
 def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | None) -> Setup | None:
     """Open the data, build the method, restore a checkpoint, and write run.json; None if the run is finished."""
-    asked = replace(asked, init=asked.init.resolved())
-    device = pick_device(local_device(asked.device))
+    asked, device = check_start(asked, out)
     pack = open_pack(asked.data, world, quiet) if pack is None else pack
     if asked.positives_within:
         places(pack, pack.spec.window)
@@ -89,6 +88,14 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     if world.is_main:
         _record(setup, asked, out, start, taken, quiet=quiet)
     return setup
+
+
+def check_start(asked: Run, out: Path) -> tuple[Run, torch.device]:
+    """The run with the digest of its start weights, and its device; ValueError without them, before data is made."""
+    for file in leaks.weights_files(asked) if not (out / "run.json").exists() else ():
+        if not file.is_file():
+            raise ValueError(f"weights {str(file)!r}: give imagenet, scratch, or a file that exists")
+    return replace(asked, init=asked.init.resolved()), pick_device(local_device(asked.device))
 
 
 def _record(setup: Setup, asked: Run, out: Path, start: Start | None, taken: dict[str, Any], *, quiet: bool) -> None:
