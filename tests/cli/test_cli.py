@@ -34,7 +34,6 @@ WRONG = (
     "demo --recipe nosuch",
     "probe nosuch",
     "probe --folds 1",
-    "probe --nosuch",
     "report nosuch",
     "publish nosuch out",
     "export nosuch --out out",

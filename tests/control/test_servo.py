@@ -193,27 +193,27 @@ def test_changed_results_are_refused(done: Path, tmp_path: Path, why: str) -> No
         result.read_control(path)
 
 
+def measured(name: str, *rows: tuple[str, int | None, float]) -> dict[str, Any]:
+    """A result of eight straight edges; ``rows``: source, seed and mm."""
+    cell = {"task": "straight", "condition": "late", "n": [4.0] * 8, "deg": [0.0] * 8, "lost": [0.0] * 8}
+    cells = ({"source": s, "seed": k, "cells": [cell | {"mm": [4 * mm] * 8}]} for s, k, mm in rows)
+    return {"rows": list(cells), "encoder": {"name": name}}
+
+
 def test_a_star_is_over_shapes_and_seeds(small: Servo) -> None:
     """Untrained trunks that differ among themselves as much as from the row are no evidence, however alike their shapes."""
 
     def marked(untrained: tuple[float, float]) -> bool:
-        lines = [("pixels", None, 1.0), *(("untrained", seed, mm) for seed, mm in enumerate(untrained))]
-        cells = {"task": "straight", "condition": "late", "n": [4.0] * 8, "deg": [0.0] * 8, "lost": [0.0] * 8}
-        rows = [{"source": s, "seed": seed, "cells": [{**cells, "mm": [4 * mm] * 8}]} for s, seed, mm in lines]
-        known = result.scores([{"rows": rows, "encoder": {"name": "mine"}}])
+        rows = (("untrained", seed, mm) for seed, mm in enumerate(untrained))
+        known = result.scores([measured("mine", ("pixels", None, 1.0), *rows)])
         return result._cell(small, known, "pixels", ("straight", "late")).endswith("*")
 
     assert marked((2.0, 2.02)) and not marked((2.0, 1.2))
 
 
 def test_each_encoder_is_beside_the_controls_of_its_result(small: Servo) -> None:
-    def value(name: str, untrained: float) -> dict[str, Any]:
-        cell = {"task": "straight", "condition": "late", "n": [4.0] * 8, "deg": [0.0] * 8, "lost": [0.0] * 8}
-        rows = [("", 0, 1.0), ("untrained", 0, untrained), ("pixels", None, 3.0)]
-        cells = ({"source": s, "seed": k, "cells": [cell | {"mm": [4 * mm] * 8}]} for s, k, mm in rows)
-        return {"rows": list(cells), "encoder": {"name": name}}
-
-    values = [value("far", 2.0), value("level", 1.0)]
+    own, pixels = ("", 0, 1.0), ("pixels", None, 3.0)
+    values = [measured(name, own, ("untrained", 0, mm), pixels) for name, mm in (("far", 2.0), ("level", 1.0))]
     for each in (values, values[::-1]):
         known = result.scores(each)
         texts = {name: result._cell(small, known, name, ("straight", "late")) for name in known}

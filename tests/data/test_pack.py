@@ -37,15 +37,6 @@ def contents(path: Path) -> dict[str, bytes]:
     return {name: (path / name).read_bytes() for name in FILES}
 
 
-def test_rows_and_images_belong_together(pack: Pack) -> None:
-    source = Toy()
-    for row in (0, 17, 119):
-        sample = source.read(row)[0]
-        assert pack.column("id")[row] == sample.columns["id"]
-        for modality in ("vision", "touch"):
-            assert np.array_equal(pack.images[modality][row], getattr(sample, modality))
-
-
 @pytest.mark.parametrize("store", ["raw", "jpeg"])
 def test_two_processes_give_the_bytes_of_one(tmp_path: Path, store: Any) -> None:
     one, two = (build(Toy(), tmp_path / str(n), size=32, workers=n, store=store, quiet=True) for n in (1, 2))

@@ -176,6 +176,10 @@ def own_times(name: str, *lines: object) -> Callable[[Path], None]:
             r"force\.csv, column stamp: all \d+ times are 0\.3 s: a clock that stands still",
         ),
         (own_times("txt", *range(49)), r"gel_timestamps\.txt has 49 times, gel\.mp4 has 50 frames"),
+        (
+            lambda root: [own_times(kind, "time", *range(50))(root) for kind in ("txt", "csv")],
+            r"gel_timestamps\.txt and gel_timestamps\.csv both have the times of gel\.mp4",
+        ),
     ],
 )
 def test_logs_that_would_give_wrong_numbers(tmp_path: Path, change: Callable[[Path], None], says: str) -> None:
@@ -203,15 +207,6 @@ def test_logs_that_cannot_be_joined(tmp_path: Path, options: dict[str, Any], say
     write_csv(root / "0/back.csv", t=[0, 1, 0.4, 1.4], x=[0, 1, 2, 3])
     with pytest.raises(ValueError, match=says):
         packed(root, tmp_path / "p", **{**LOG, **options})
-
-
-def test_two_lists_of_times_are_one_too_many(tmp_path: Path) -> None:
-    root = recorded(tmp_path / "set", num=2)
-    own_times("txt", *(0.04 * i for i in range(50)))(root)
-    own_times("csv", "time", *(0.05 * i for i in range(50)))(root)
-    says = r"gel_timestamps\.txt and gel_timestamps\.csv both have the times of gel\.mp4"
-    with pytest.raises(ValueError, match=says):
-        packed(root, tmp_path / "p", **LOG)
 
 
 def test_rows_with_one_stamp_are_counted(tmp_path: Path) -> None:

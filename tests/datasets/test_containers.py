@@ -372,8 +372,6 @@ def test_a_bad_cell_costs_its_own_row_only(tmp_path: Path) -> None:
     rows = [{"touch": b"no picture" if i == 3 else png(i), "kind": i % 2} for i in range(20)]
     pq.write_table(pa.Table.from_pylist(rows), tmp_path / "bad.parquet")
     source = FolderConfig(path=tmp_path / "bad.parquet", labels=("kind",), size=16).source()
-    with pytest.raises(ValueError, match=r"1 of 20 samples cannot be read, first row 4: .*row group 0 row 3"):
-        build(source, tmp_path / "none", size=16, quiet=True)
     pack = build(source, tmp_path / "pack", size=16, quiet=True, max_damaged=0.1)
     assert [level(image) for image in pack.images["touch"]] == [i for i in range(20) if i != 3]
     assert [name for name, _ in pack.meta["damaged"]] == ["row 4"]

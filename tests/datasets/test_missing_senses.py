@@ -40,10 +40,6 @@ def test_holes_are_zeros_and_marked(holes: Pack) -> None:
     assert both < set(holes.rows("train", having=("touch",))) < set(holes.rows("train"))
 
 
-def test_a_pack_without_holes_has_everything(pack: Pack) -> None:
-    assert pack.has("vision").all() and pack.has("touch").all() and "has_touch" not in pack.table.column_names
-
-
 @pytest.mark.parametrize("column", [True, None])
 def test_an_image_must_agree_with_its_mark(tmp_path: Path, column: bool | None) -> None:
     class Lying(Toy):
@@ -68,9 +64,13 @@ def test_training_sees_whole_pairs_only(holes: Pack, tmp_path: Path, monkeypatch
     assert whole[draw_positives(holes, np.array(seen), torch.Generator().manual_seed(0))].all()
 
 
-def test_probes_see_only_what_is_there(holes: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module")
+def trained(holes: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = replace(recipe("smoke", PackConfig(path=holes.path, size=32)), steps=1, eval_every=0)
-    train(run, tmp_path / "run", quiet=True)
+    return train(run, tmp_path_factory.mktemp("holes") / "run", quiet=True)
+
+
+def test_probes_see_only_what_is_there(holes: Pack, trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: dict[str, set[int]] = {"vision": set(), "touch": set()}
     real = sensors.features
 
@@ -79,7 +79,7 @@ def test_probes_see_only_what_is_there(holes: Pack, tmp_path: Path, monkeypatch:
         return real(model, pack, modality, rows, **options)  # type: ignore[arg-type]
 
     monkeypatch.setattr(sensors, "features", features)
-    result = probe_runs([tmp_path / "run"], ProbeConfig(tasks=("pattern",)), holes)
+    result = probe_runs([trained], ProbeConfig(tasks=("pattern",)), holes)
     for modality, rows in asked.items():
         assert rows and holes.has(modality)[sorted(rows)].all()
     task = holes.spec.tasks[0]
@@ -89,9 +89,8 @@ def test_probes_see_only_what_is_there(holes: Pack, tmp_path: Path, monkeypatch:
 
 
 @pytest.fixture(scope="module")
-def model(holes: Pack, tmp_path_factory: pytest.TempPathFactory) -> Model:
-    run = replace(recipe("smoke", PackConfig(path=holes.path, size=32)), steps=1, eval_every=0)
-    return load(train(run, tmp_path_factory.mktemp("holes") / "run", quiet=True))
+def model(trained: Path) -> Model:
+    return load(trained)
 
 
 def test_published_probes_are_of_what_is_there(holes: Pack, model: Model) -> None:

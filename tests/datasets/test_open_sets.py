@@ -171,9 +171,6 @@ def test_frames_are_counted_and_spread(tmp_path: Path) -> None:
     assert num_frames(film(tmp_path / "a.mov", 37)) == 37
     assert spread(12, 450)[:3] == [0, 41, 82] and spread(12, 450)[-1] == 449
     assert spread(8, 3) == [0, 1, 2] and spread(3, 101, 0.25, 0.75) == [25, 50, 75]
-    (tmp_path / "b.mov").write_text("nothing")
-    with pytest.raises(ValueError, match=r"b\.mov cannot be read as a video"):
-        num_frames(tmp_path / "b.mov")
 
 
 def test_slip_grasp_labels_no_late_frame_where_early_ones_are_lost(tmp_path: Path) -> None:

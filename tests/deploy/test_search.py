@@ -12,13 +12,8 @@ import mvitac
 from mvitac.cli.main import main
 from mvitac.data.images import fit
 from mvitac.data.pack import Pack
-from mvitac.deploy.search import Embeddings, nearest
+from mvitac.deploy.search import Embeddings, nearest, unit
 from mvitac.model import Model
-
-
-def unit(rng: np.random.Generator, *shape: int) -> np.ndarray:
-    x = rng.normal(size=shape).astype(np.float32)
-    return x / np.linalg.norm(x, axis=-1, keepdims=True)
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +32,7 @@ def test_equals_scikit_learn() -> None:
     from sklearn.neighbors import NearestNeighbors
 
     rng = np.random.default_rng(1)
-    bank, queries = unit(rng, 3000, 32), unit(rng, 20, 32)
+    bank, queries = (unit(rng.normal(size=(num, 32)).astype(np.float32)) for num in (3000, 20))
     by = NearestNeighbors(n_neighbors=5, algorithm="brute", metric="cosine").fit(bank)
     distances, expected = by.kneighbors(queries)
     rows, cosines = nearest(bank, queries, 5)

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mvitac import __version__
-from mvitac.registry import unknown
+from mvitac.registry import check_known, unknown
 
 HELP = (Path(__file__).parent / "help.txt").read_text(encoding="utf-8")
 
@@ -95,8 +95,7 @@ def _run(arguments: list[str]) -> int:
     name, rest = arguments[0], arguments[1:]
     if name == "data" or (rest and f"{name} {rest[0]}" in COMMANDS):
         name, rest = f"{name} {rest[0]}", rest[1:]
-    if name not in COMMANDS:
-        raise unknown("command", name, COMMANDS)
+    check_known("command", [name], COMMANDS)
     text = help_file(name)
     if rest in (["--help"], ["-h"]) and text.exists():
         print(text.read_text(encoding="utf-8"), end="")

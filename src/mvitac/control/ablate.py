@@ -33,7 +33,7 @@ from mvitac.data.windows import places, recordings
 from mvitac.datasets.lerobot import FELT
 from mvitac.deploy.artifact import load
 from mvitac.evaluation.intervals import mean_interval
-from mvitac.registry import unknown
+from mvitac.registry import check_known
 from mvitac.system.files import brief
 from mvitac.system.progress import work
 
@@ -128,8 +128,7 @@ def _touched(pack: Pack, rows: Sequence[np.ndarray]) -> np.ndarray:
 
 def suite_episodes(suite: Any, cell: tuple[str, ...]) -> Episodes:
     """The episodes of a suite of one task and condition."""
-    if cell not in suite.cells(OWN):
-        raise unknown(f"task and condition of {suite.name}", "/".join(cell), map("/".join, suite.cells(OWN)))
+    check_known(f"task and condition of {suite.name}", ["/".join(cell)], [*map("/".join, suite.cells(OWN))])
     begin = [partial(suite.world, *cell, number) for number in range(suite.num)]
     return Episodes(begin, begin[0]().senses, unit=suite.failure)
 
