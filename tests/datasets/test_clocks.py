@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from PIL import Image
 
 from mvitac.data.build import build
 from mvitac.data.checks.examine import examine_source
@@ -22,7 +21,7 @@ from mvitac.data.checks.value_checks import time_shift
 from mvitac.data.pack import Pack
 from mvitac.data.stamps import seconds
 from mvitac.datasets.folder import FolderConfig
-from support.videos import film, shade, write_video
+from support.videos import film, picture, shade, write_video
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "wedge_force" / "manifest.csv"
 START = 1_700_000_000.0
@@ -130,10 +129,9 @@ def test_two_cameras_out_of_step_are_paired_by_time(tmp_path: Path) -> None:
 
 def test_a_list_of_another_camera_is_a_log(tmp_path: Path) -> None:
     def pictures(folder: str, modality: str, times: np.ndarray, **columns: list[int]) -> Path:
-        (tmp_path / folder).mkdir()
         names = [f"{i}.png" for i in range(len(times))]
         for i, name in enumerate(names):
-            Image.new("RGB", (16, 16), (5 * i, 0, 0)).save(tmp_path / folder / name)
+            picture(tmp_path / folder / name, 5 * i)
         return write_csv(tmp_path / folder / "list.csv", **{modality: names}, time=times, **columns)
 
     gel = pictures("gel", "touch", np.arange(30) / 30, take=[i // 10 for i in range(30)])
@@ -265,9 +263,8 @@ def test_videos_without_labels_are_data(tmp_path: Path) -> None:
 
 
 def test_images_without_labels_are_one_recording(tmp_path: Path) -> None:
-    (tmp_path / "digit").mkdir()
     for i in range(20):
-        Image.new("RGB", (16, 16), (10 * i, 0, 0)).save(tmp_path / f"digit/frame_{i}.png")
+        picture(tmp_path / f"digit/frame_{i}.png", 10 * i)
     pack = packed(tmp_path / "digit", tmp_path / "p")
     assert pack.images["touch"][:, 0, 0, 0].tolist() == [10 * i for i in range(20)]  # 2 before 10
     assert pack.column("split").tolist() == ["train"] * 18 + ["val"] * 2 and "time" not in pack.table.column_names

@@ -31,6 +31,7 @@ from mvitac.recipes import recipe
 from mvitac.registry import from_json, to_json
 from mvitac.run import Run
 from mvitac.system.files import cache_dir
+from support.videos import picture
 
 NUM = 24
 Table = list[dict[str, Any]]
@@ -46,9 +47,7 @@ def make_rows(root: Path) -> Table:
     rows: Table = []
     for i in range(NUM):
         for which, name in enumerate(("vision", "left", "right")):
-            path = root / name / f"{i:02d}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            Image.new("RGB", (20, 16), colour(i, which)).save(path)
+            picture(root / name / f"{i:02d}.png", colour(i, which), (20, 16))
         place = i // 3
         rows.append(
             {
@@ -136,11 +135,9 @@ def test_paths_are_relative_to_the_manifest_and_the_fingerprint_to_nothing(tmp_p
 
 def write_plain(folder: Path, level: int, when: int, *, suffix: str = "bmp") -> FolderConfig:
     """40 plain pictures, of one size as BMP, all written at second ``when``."""
-    folder.mkdir(parents=True, exist_ok=True)
     names = [f"{i}.{suffix}" for i in range(40)]
     for name in names:
-        Image.new("RGB", (16, 16), (level, 0, 0)).save(folder / name)
-        os.utime(folder / name, (when, when))
+        os.utime(picture(folder / name, level), (when, when))
     rows = [{"touch": name, "split": "train" if i < 20 else "test"} for i, name in enumerate(names)]
     return FolderConfig(path=write(rows, folder / "manifest.csv"), size=16, workers=1)
 
@@ -252,12 +249,6 @@ def test_numbers_must_not_take_the_place_of_a_column_of_the_pack(
 def test_a_config_survives_json(tmp_path: Path) -> None:
     run = recipe("smoke", config(tmp_path, controls=("a=b",), only=("seq<=4",), vision=""), phased=False)
     assert from_json(Run, json.loads(json.dumps(to_json(run)))) == run
-
-
-def picture(path: Path, shade: int = 0) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.new("RGB", (16, 16), (shade, 0, 0)).save(path)
-    return path
 
 
 @pytest.mark.parametrize("kind", ["pairs", "a gap", "plain"])

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from mvitac.bench.suite import find_suite, open_set
 from mvitac.cli.main import main
@@ -21,12 +20,7 @@ from mvitac.datasets.slip_grasp import SlipGraspConfig
 from mvitac.datasets.slip_gsmini import SlipGSMiniConfig
 from mvitac.datasets.table.splits import folds
 from mvitac.datasets.vt60 import VT60Config
-from support.videos import film, level, shade
-
-
-def plain(path: Path, value: int) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.new("RGB", (32, 24), (value, value, value)).save(path, quality=95)
+from support.videos import film, level, picture, shade
 
 
 def make_slip_grasp(root: Path) -> None:
@@ -40,7 +34,7 @@ def make_slip_grasp(root: Path) -> None:
             for frame in range(key - 5, key + 16):
                 for kind, shift in (("external", 0), ("gelsight", 100), ("gelsight_lab", 200)):
                     name = f"{kind}_imgw{folder}{infix}{frame:08d}.jpg"
-                    plain(root / f"data/object{k + 1:03d}/{folder}_mm" / name, shift + frame - key + 5 + 25 * (g % 2))
+                    picture(root / f"data/object{k + 1:03d}/{folder}_mm" / name, shift + frame - key + 5 + 25 * (g % 2))
         (root / f"data/object{k + 1:03d}_result.dat").write_text("\n".join(lines))  # no final newline
 
 
@@ -99,12 +93,12 @@ def make_vt60(root: Path) -> None:
         for i in range(1, 7):
             for k in range(3):
                 name = f"IMG_inst_{i}_img_{9 + k}_validframeID_{62 + k}.jpg"  # 9, 10, 11: not in the order of names
-                plain(base / f"vision/{category}/0{i}" / name, 10 * k + i)
+                picture(base / f"vision/{category}/0{i}" / name, 10 * k + i)
             for k in range(5):
                 name = f"touch_{i}_img_{8 + k}_name_{category[3:]}_red_at_{42094 + k}_-{k}_25275.jpg"
-                plain(base / f"touch/{category}/0{i}" / name, 100 + 10 * k + i)
+                picture(base / f"touch/{category}/0{i}" / name, 100 + 10 * k + i)
     for k in range(2):
-        plain(base / f"vision/03_ball/07/IMG_inst_7_img_{k}_validframeID_1.jpg", k)  # photos only
+        picture(base / f"vision/03_ball/07/IMG_inst_7_img_{k}_validframeID_1.jpg", k)  # photos only
 
 
 SETS: dict[str, tuple[Callable[[Path], None], type[DatasetConfig]]] = {

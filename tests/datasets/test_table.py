@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from mvitac.data import video
 from mvitac.data.build import build
@@ -19,15 +18,9 @@ from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.table import table as rows_module
-from support.videos import film, level, shade
+from support.videos import film, level, picture, shade
 
 Table = list[dict[str, Any]]
-
-
-def plain(path: Path, value: int | tuple[int, int, int], size: tuple[int, int] = (20, 16)) -> str:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.new("RGB", size, (value, value, value) if isinstance(value, int) else value).save(path)
-    return path.name
 
 
 def table(file: Path, rows: Table) -> Path:
@@ -97,7 +90,7 @@ def test_every_video_is_decoded_once(films: Path, tmp_path: Path, monkeypatch: p
 
 def test_no_video_is_split_where_no_group_is_given(films: Path, tmp_path: Path) -> None:
     rows = [{"touch": f"{k}/gel.avi", "frame": i, "label": "ab"[k % 2]} for k in range(4) for i in range(12)]
-    rows += [{"touch": plain(films / "alone.png", 200), "frame": "", "label": "a"}]
+    rows += [{"touch": picture(films / "alone.png", 200).name, "frame": "", "label": "a"}]
     pack = packed(table(films / "loose.csv", rows), tmp_path / "pack", labels=("label",), val_share=0.0)
     videos = [rows[int(name) - 1]["touch"] for name in pack.column("id")]
     assert len(set(zip(videos, pack.column("split"), strict=True))) == len(set(videos)) == 5
@@ -167,9 +160,9 @@ def gappy(root: Path) -> Table:
     rows: Table = []
     for i in range(24):
         row = {
-            "vision": f"v/{plain(root / f'v/{i}.png', 10 + i)}",
-            "left": f"l/{plain(root / f'l/{i}.png', 100 + i)}",
-            "right": f"r/{plain(root / f'r/{i}.png', 200 + i)}",
+            "vision": f"v/{picture(root / f'v/{i}.png', 10 + i).name}",
+            "left": f"l/{picture(root / f'l/{i}.png', 100 + i).name}",
+            "right": f"r/{picture(root / f'r/{i}.png', 200 + i).name}",
             "label": "ab"[i // 2 % 2],
             "object": i // 2,
         }
@@ -214,8 +207,8 @@ def pressed(root: Path) -> Table:
         value = base + (2 * (i % 12) - 1 if empty else 5 * (i % 12) - 40)
         rows.append(
             {
-                "touch": plain(root / f"{i}.png", value),
-                "background": plain(root / f"own{i}.png", 50 + i),
+                "touch": picture(root / f"{i}.png", value).name,
+                "background": picture(root / f"own{i}.png", 50 + i).name,
                 "sensor": ("digit", "mini")[i // 12],
                 "phase": "empty" if empty else "press",
                 "label": "ab"[i % 2],

@@ -34,7 +34,7 @@ from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.retrieval import retrieved_rows
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
-from support.videos import numbered, read_number, write_video
+from support.videos import numbered, picture, read_number, write_video
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 LISTS, SAMPLE = SHARED / "touch_and_go_lists", SHARED / "touch_and_go_sample"
@@ -284,11 +284,8 @@ def test_the_cache_knows_changed_jpegs(tmp_path: Path) -> None:
         for name in NAMES[:2]:
             for stem in ("video", "gelsight"):
                 folder = tmp_path / "dataset" / name / f"{stem}_frame"
-                folder.mkdir(parents=True, exist_ok=True)
                 for number in range(6):
-                    file = folder / f"{number:010d}.jpg"
-                    Image.new("RGB", (16, 16), (level, level, level)).save(file)
-                    os.utime(file, (when, when))
+                    os.utime(picture(folder / f"{number:010d}.jpg", level), (when, when))
         packs.append(config.open(quiet=True))
     assert [(pack.num, int(pack.images["touch"][0, 0, 0, 0])) for pack in packs] == [(12, 40), (12, 200)]
     assert packs[0].meta["fingerprint"] == packs[1].meta["fingerprint"]

@@ -1,4 +1,4 @@
-"""Videos whose every frame says which it is: by black and white blocks and a band of colour, or by its gray."""
+"""Pictures of one colour, and videos whose every frame says which it is: by blocks and a band of colour, or by its gray."""
 
 import struct
 from collections.abc import Callable
@@ -7,10 +7,18 @@ from typing import Any
 
 import av
 import numpy as np
+from PIL import Image
 
 BITS = 12
 WIDTH, HEIGHT = 160, 120
 COLOURS = {"vision": (220, 60, 40), "touch": (40, 90, 220)}
+
+
+def picture(path: Path, colour: int | tuple[int, int, int] = 0, size: tuple[int, int] = (16, 16)) -> Path:
+    """A picture of one gray or colour, in a folder that need not be there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", size, (colour,) * 3 if isinstance(colour, int) else colour).save(path, quality=95)
+    return path
 
 
 def numbered(number: int, stream: str) -> np.ndarray:

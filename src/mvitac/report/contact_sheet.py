@@ -14,7 +14,7 @@ Tile = tuple[np.ndarray, str]  # a picture, uint8 [H, W, 3], and the text below 
 Block = tuple[str, Sequence[Tile]]  # pictures under one heading
 SIDE, NUM_SHOWN, NUM_SAMPLE = 96, 8, 6  # pixels; rows shown of a finding; rows of a class
 LIMIT = 40  # classes of a sheet
-GAP = 8  # pixels between pictures
+WIDTH, GAP = 1280, 8  # pixels: of a sheet (more for a picture that is wider); between pictures
 MISSING, CROSS = 225, 150  # gray levels of the tile that stands for a missing image
 
 
@@ -80,15 +80,12 @@ def contents(pack: Pack) -> str:
     return ", ".join([*(["camera"] if pack.spec.vision_channels else []), *touch])
 
 
-def draw(title: str, blocks: Sequence[Block], *, width: int = 1280) -> Image.Image:
-    """Draw ``blocks`` below each other: a heading, then pictures in rows of equal length, with their captions.
-
-    ``width`` in pixels is kept if it has room for one picture.
-    """
+def draw(title: str, blocks: Sequence[Block]) -> Image.Image:
+    """Draw ``blocks`` below each other: a heading, then pictures in rows of equal length, with their captions."""
     cell = GAP + max((image.shape[1] for _, tiles in blocks for image, _ in tiles), default=480)
     most = max([1, *(len(tiles) for _, tiles in blocks)])
-    columns = -(-most // -(-most // max(1, width // cell)))
-    room = max(columns * cell, min(width, 480))
+    columns = -(-most // -(-most // max(1, WIDTH // cell)))
+    room = max(columns * cell, 480)
     bands = [_text(title, room, 13)]
     for heading, tiles in blocks:
         bands.append(_text(heading, room, 14))
