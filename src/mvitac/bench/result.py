@@ -90,14 +90,8 @@ def sign(
 ) -> dict[str, Any]:
     """The whole result with its digest. ``found`` is what was measured, ``here`` ``provenance``, with the time."""
     versions = here.pop("versions")
-    value = {
-        **dict(zip(("format", "format_version"), form, strict=True)),
-        "suite": suite.definition(),
-        "suite_digest": suite.digest(),
-        "encoder": encoder,
-        "versions": versions,
-        **found,
-    }
+    value = {"format": form[0], "format_version": form[1], "suite": suite.definition(), "suite_digest": suite.digest()}
+    value |= {"encoder": encoder, "versions": versions, **found}
     return {**value, "digest": digest(value), "about": here}
 
 

@@ -196,20 +196,13 @@ def _block(
     pack = opened.packs[0]
     why = {m: [misfit(entry.models[0], pack, each) for each in names_in(m, pack)] for m in ask.modalities}
     left_out = {m: next(filter(None, reasons)) for m, reasons in why.items() if any(reasons)}
+    block: dict[str, Any] = {"set": one.name, "task": task.name}
     if not own:
-        return {"set": one.name, "task": task.name, "not_run": next(iter(left_out.values()))}
+        return block | {"not_run": next(iter(left_out.values()))}
     names = [np.unique(v.column("group")[split_rows(v, task).test].astype(str)).tolist() for v in opened.packs]
-    return {
-        "set": one.name,
-        "task": task.name,
-        "form": opened.form,
-        "data": opened.digests,
-        "group_by": pack.spec.group_by,
-        "groups": [name for fold in names for name in fold],
-        "leaks": entry.leaks(opened, task, one.names),
-        "left_out": left_out,
-        "records": [*own, *controls],
-    }
+    block |= {"form": opened.form, "data": opened.digests, "group_by": pack.spec.group_by}
+    block |= {"groups": [name for fold in names for name in fold], "leaks": entry.leaks(opened, task, one.names)}
+    return block | {"left_out": left_out, "records": [*own, *controls]}
 
 
 def kept_part(parts: Path, key: str, about: list[Any], score: Callable[[], Records]) -> Records:

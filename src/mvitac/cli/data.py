@@ -122,23 +122,13 @@ def _describe(pack: Pack) -> dict[str, Any]:
             if pack.spec.values:
                 splits[split]["values"] = measured(pack, rows)
     has = {m: pack.has(m) for m in pack.spec.modalities}
-    return {
-        "path": str(pack.path),
-        "name": pack.spec.name,
-        "rows": pack.num,
-        "size": pack.size,
-        "store": pack.store,
-        "group_by": pack.spec.group_by,
-        "groups": len(np.unique(pack.column("group"))),
-        "splits": splits,
-        "rows_without": {m: int((~there).sum()) for m, there in has.items() if not there.all()},
-        **({"sensors": list(pack.sensor_names)} if "sensor" in pack.table.column_names else {}),
-        "whole_pairs": int(np.logical_and.reduce(list(has.values())).sum()),
-        "source": pack.spec.source,
-        "licence": pack.spec.licence,
-        "notes": list(pack.spec.notes),
-        "digest": pack.digest,
-    }
+    spec, groups = pack.spec, len(np.unique(pack.column("group")))
+    about = {"path": str(pack.path), "name": spec.name, "rows": pack.num, "size": pack.size, "store": pack.store}
+    about |= {"group_by": spec.group_by, "groups": groups, "splits": splits}
+    about["rows_without"] = {m: int((~there).sum()) for m, there in has.items() if not there.all()}
+    about |= {"sensors": list(pack.sensor_names)} if "sensor" in pack.table.column_names else {}
+    about["whole_pairs"] = int(np.logical_and.reduce(list(has.values())).sum())
+    return about | {"source": spec.source, "licence": spec.licence, "notes": list(spec.notes), "digest": pack.digest}
 
 
 def measured(pack: Pack, rows: np.ndarray) -> list[dict[str, Any]]:

@@ -28,17 +28,13 @@ def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_clas
     _, recall, f1, _ = precision_recall_fscore_support(y, guess, labels=present, average="macro", **no_division)
     if num_classes == 2 and len(present) == 2:
         auroc = float(roc_auc_score(y, probabilities[:, 1]))
-    return {
-        "accuracy": float((guess == y).mean()),
-        "balanced_accuracy": float(recall),
-        "macro_f1": float(f1),
-        "auroc": auroc,
-        "confusion": confusion_matrix(y, guess, labels=range(num_classes)).tolist(),
-        "class_groups": [len(np.unique(groups[y == k])) for k in range(num_classes)],
-        "num_test": len(y),
-        "group_sizes": np.bincount(groups, minlength=num_groups).tolist(),
-        "group_correct": np.bincount(groups, weights=guess == y, minlength=num_groups).astype(int).tolist(),
-    }
+    whole = {"accuracy": float((guess == y).mean()), "balanced_accuracy": float(recall), "macro_f1": float(f1)}
+    whole |= {"auroc": auroc, "confusion": confusion_matrix(y, guess, labels=range(num_classes)).tolist()}
+    class_groups = [len(np.unique(groups[y == k])) for k in range(num_classes)]
+    sizes = np.bincount(groups, minlength=num_groups).tolist()
+    correct = np.bincount(groups, weights=guess == y, minlength=num_groups).astype(int).tolist()
+    by_group = {"num_test": len(y), "group_sizes": sizes, "group_correct": correct}
+    return {**whole, "class_groups": class_groups, **by_group}
 
 
 def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:

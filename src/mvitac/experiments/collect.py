@@ -162,17 +162,12 @@ def cost(label: str, jobs: Sequence[Job], pack: Pack) -> dict[str, Any]:
     run = jobs[0].run
     rows = len(run.method.training_rows(pack))
     method = run.method.build(pack.spec, run.encoder.changed(weights=SCRATCH))
-    steps = run.num_steps(rows)
-    return {
-        "row": label,
-        "seeds": len(jobs),
-        "steps": steps,
-        "pairs": steps * run.batch_size,
-        "pairs_of": pairs_of(run, method.views, pack),
-        "images": steps * run.batch_size * method.views * len(method.encoders()),
-        "trained_parameters": sum(p.numel() for p in method.parameters() if p.requires_grad),
-        "seconds": statistics.median(job.seconds() for job in jobs),
-    }
+    pairs = (steps := run.num_steps(rows)) * run.batch_size
+    trained = sum(p.numel() for p in method.parameters() if p.requires_grad)
+    seen = {"pairs": pairs, "pairs_of": pairs_of(run, method.views, pack)}
+    seen |= {"images": pairs * method.views * len(method.encoders()), "trained_parameters": trained}
+    seconds = statistics.median(job.seconds() for job in jobs)
+    return {"row": label, "seeds": len(jobs), "steps": steps, **seen, "seconds": seconds}
 
 
 def pairs_of(run: Run, views: int, pack: Pack) -> str:
