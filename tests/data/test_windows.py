@@ -164,12 +164,13 @@ def test_positives_can_be_near_in_time(presses: Pack, tmp_path: Path) -> None:
 def test_frames_without_an_order_are_refused_and_positives_near_in_time_that_cannot_be(
     presses: Pack, pack: Pack, tmp_path: Path
 ) -> None:
-    with pytest.raises(ValueError, match="none of the columns frame, seq, time"):
-        windowed(pack, Window(frames=2))
+    for order, says in ((None, "frame, seq, time"), ("frame", "frame"), ("fram", "fram")):
+        with pytest.raises(ValueError, match=f"{pack.path} has no {says} to order frames: train with another"):
+            windowed(pack, Window(frames=2, order=order))
     run = recipe("smoke", PackConfig(path=presses.path))
     with pytest.raises(ValueError, match="no effect on same-image positives"):
         replace(run, positives="same-image", positives_within=2.0)
     unordered = replace(run, data=PackConfig(path=pack.path), positives="same-touch", positives_within=2.0)
-    with pytest.raises(ValueError, match="none of the columns frame, seq, time"):
+    with pytest.raises(ValueError, match="has no frame, seq, time to order frames"):
         train(unordered, tmp_path / "run", quiet=True)
     assert not (tmp_path / "run" / "run.json").exists()

@@ -105,9 +105,10 @@ def _touch(pack: Pack, rows: np.ndarray) -> str:
 
 def places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
     """Name and values [N] of the column that orders the frames."""
-    name = window.order or next((column for column in ORDER if column in pack.table.column_names), None)
+    asked = (window.order,) if window.order else ORDER
+    name = next((column for column in asked if column in pack.table.column_names), None)
     if name is None:
-        raise ValueError(f"{pack.spec.name!r} has none of the columns {', '.join(ORDER)}: name its order, --data.order")
+        raise ValueError(f"{pack.path} has no {', '.join(asked)} to order frames: train with another --data.order")
     place = np.array([_number(cell) for cell in pack.column(name)])
     if not np.isfinite(place).all():
         row = int(np.flatnonzero(~np.isfinite(place))[0])

@@ -18,12 +18,10 @@ class Busy(ValueError):
 
 @contextmanager
 def hold_lock(place: Path, busy: str, *, wait: bool, quiet: bool = False) -> Iterator[bool]:
-    """Hold the file lock ``<place>.lock`` of a pack or run. A thread may hold the same lock twice.
+    """Hold the file lock ``<place>.lock``; yields whether the file was there, left by a process that was killed.
 
-    Yields whether the file was there: a process that was killed left it.
-
-    Locks work between machines if their shared file system supports them; otherwise nothing is locked. If another
-    process holds it, ``wait`` for it after printing ``busy`` (unless ``quiet``), or raise ``Busy`` with that message.
+    A thread may hold the same lock twice. Locks work between machines if their shared file system supports them. If
+    another process holds it, ``wait`` after printing ``busy`` (unless ``quiet``), or raise ``Busy`` with that message.
     """
     # No soft lock: it would remain after a process is killed.
     lock = FileLock(f"{place.absolute()}.lock", fallback_to_soft=False, is_singleton=True)
@@ -54,8 +52,7 @@ def new_folder(out: Path) -> Iterator[Path]:
     Raises Busy if another process writes ``out``, ValueError if it exists or cannot be written.
     """
     check_place(out)
-    busy = f"{out} is being written by another process: wait, or choose another place"
-    with hold_lock(out, busy, wait=False) as left:
+    with hold_lock(out, f"{out} is being written by another process: wait, or choose another", wait=False) as left:
         partial = out.with_name(out.name + ".partial")
         for place in (out, *[partial] * (not left)):
             if os.path.lexists(place):
