@@ -225,6 +225,9 @@ def test_files_that_are_no_videos(made: dict[str, Path], tmp_path: Path) -> None
     (tmp_path / "part.mkv").write_bytes(made["h264-mkv"].read_bytes()[:-4000])
     with pytest.raises(ValueError, match=r"part\.mkv ends after \d\.\d s of 00:00:.*: it is cut off"):
         num_frames(tmp_path / "part.mkv")
+    (tmp_path / "codec.mp4").write_bytes(made["h264"].read_bytes().replace(b"avc1\0", b"zzzz\0"))
+    with pytest.raises(ValueError, match=r"codec\.mp4 holds no video that can be decoded"):
+        num_frames(tmp_path / "codec.mp4")
     with pytest.raises(FileNotFoundError, match=r"gone\.mp4"):
         num_frames(tmp_path / "gone.mp4")
     with av.open(str(tmp_path / "sound.mp4"), "w") as container:

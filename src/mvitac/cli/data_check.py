@@ -19,7 +19,7 @@ from mvitac.datasets.mix import open_packs
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.report.contact_sheet import draw, samples, suspicious
-from mvitac.system.files import check_place, write_atomic
+from mvitac.system.files import write_atomic
 
 _MANUAL = """Examine a dataset: unreadable, constant, BGR, copied, leaking, out of step, outside train.
 
@@ -78,9 +78,9 @@ def check(argv: list[str]) -> int:
 def _sheet(what: str, options: _Options) -> Draw | None:
     """What draws the contact sheet that ``options`` ask for; ValueError if their files cannot be written."""
     check_json(options.json)
-    if not (out := options.sheet):
+    check_json(out := options.sheet, "--sheet")
+    if not out:
         return None
-    check_place(out)
 
     def sheet(pack: Pack, findings: Sequence[Finding]) -> None:
         blocks = [*suspicious(pack, findings), *samples(pack)]

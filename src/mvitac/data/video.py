@@ -199,8 +199,8 @@ def _opened(path: str | Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         raise ValueError(f"{path} is no file: a pipe would be waited for for ever")
     try:
         with av.open(str(path)) as container:
-            if not container.streams.video:
-                raise ValueError(f"{path} holds no video: give another file")
+            if not container.streams.video or not container.streams.video[0].codec_context:  # None: no such codec
+                raise ValueError(f"{path} holds no video that can be decoded: give another file")
             stream = container.streams.video[0]
             stream.codec_context.thread_count = 1  # packing has a process per core
             # Report damage instead of concealing it.
