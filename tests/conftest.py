@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import ctypes
 import gc
 import os
 import shutil
@@ -61,19 +60,9 @@ def turned(tmp_path_factory: pytest.TempPathFactory) -> Pack:
     return build(Turned(), tmp_path_factory.mktemp("turned") / "pack", size=32, quiet=True)
 
 
-class SignalStack(ctypes.Structure):
-    """``stack_t`` of Linux."""
-
-    _fields_ = (("sp", ctypes.c_void_p), ("flags", ctypes.c_int), ("size", ctypes.c_size_t))
-
-
 @pytest.fixture
 def ctrl_c() -> Iterator[None]:
-    """Ctrl-C raises, as in a terminal; a shell that starts pytest in the background has it ignored.
-
-    The handler runs on the ordinary stack: after tests/live, the alternate one of this thread is no longer mapped.
-    """
-    ctypes.CDLL(None).sigaltstack(ctypes.byref(SignalStack(None, 2, 0)), None)  # 2: SS_DISABLE
+    """Ctrl-C raises, as in a terminal; a shell that starts pytest in the background has it ignored."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)

@@ -277,6 +277,16 @@ def test_openvino_tells_nobody(onnx: Path, tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*"))
 
 
+def test_a_signal_after_two_models_have_gone_is_handled(onnx: Path) -> None:
+    """OpenVINO sets the stack that signals are handled on; a DataLoader's worker that ends is one, too."""
+    code = (
+        "import signal; from pathlib import Path; from mvitac.deploy.engine import open_model;"
+        f"first, second = (open_model(Path({str(onnx / 'model.onnx')!r}), 'openvino') for _ in range(2));"
+        "del first; del second; signal.signal(signal.SIGCHLD, print); signal.raise_signal(signal.SIGCHLD)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL).returncode == 0
+
+
 def test_predicted_values_score_as_the_artifact_says(value_artifact: Path, measured: Pack) -> None:
     model, summary = mvitac.load(value_artifact), ARTIFACT.read(value_artifact)["scores"]["summary"]
     for task in measured.spec.values:

@@ -8,6 +8,7 @@
 """
 
 import bisect
+import functools
 import importlib.util
 import os
 import sys
@@ -194,13 +195,23 @@ def _onnxruntime(path: Path, threads: int) -> Call:
     return lambda arrays: session.run(None, dict(zip(names, arrays, strict=True)))  # type: ignore[return-value]
 
 
-def _openvino(path: Path, precision: str, threads: int) -> Call:
+@functools.cache
+def _core() -> Any:
+    """OpenVINO's only core in this process.
+
+    Each that compiles sets the stack that signals are handled on, and when it goes, the stack before: of two, that may be
+    one that has gone, and Ctrl-C crashes.
+    """
     # OpenVINO reports its import to an analytics host and keeps an id in the home folder. A None here makes its telemetry
     # fail to import; OpenVINO then does without.
     sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
     import openvino
 
-    core = openvino.Core()
+    return openvino.Core()
+
+
+def _openvino(path: Path, precision: str, threads: int) -> Call:
+    core = _core()
     bf16 = precision == "bf16" and "BF16" in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
     config: dict[str, Any] = {"PERFORMANCE_HINT": "LATENCY", "INFERENCE_NUM_THREADS": threads}
     config["INFERENCE_PRECISION_HINT"] = "bf16" if bf16 else "f32"
