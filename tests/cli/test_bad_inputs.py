@@ -132,7 +132,13 @@ WORDS: list[tuple[str, str, str]] = [
     (PRETRAIN, "--augment.touch.scale 0.9 0.1", "(0.9, 0.1)"),
     (PRETRAIN, "--data.num-frames 2", "--data.order"),
     (SIMULATE, "--max-damaged nan", "max_damaged nan"),
-    (SIMULATE, "--stride 2", "every frame once"),
+    (SIMULATE, "--num-frames 2 --order frame", "every frame once"),
+    (SIMULATE, "--stride 2", "--stride is for rows of several frames"),
+    ("bench {run} ", "--suite servo-v2", "did you mean 'servo-v1'"),
+    ("bench {run} ", "--suite servo-v1 --data-root {tmp}", "--data-root has no effect on servo-v1"),
+    ("predict {run} ", "--background {tmp}/a.png --calibration 9 --touch sim --out {out}", "give a video (.mp4"),
+    (PRETRAIN, "--data.frames-of both", "--data.frames-of is for rows of several frames"),
+    (PRETRAIN, "--data.order press --data.minus-first --data.stride 2", "--data.stride is for rows of several frames"),
     ("probe {run} ", "{run}", "twice"),
     ("probe {run} ", "--probes knn knn", "twice"),
     ("probe {run} ", "--tasks patern", "did you mean 'pattern'"),
@@ -383,7 +389,7 @@ def test_an_option_given_twice(refused: Callable[..., str], finished: Path) -> N
         refused(f"probe {finished} {option} 2 {other} 3", f"{option} is given twice: give it once, with all its values")
 
 
-def test_an_output_that_is_an_input(refused: Callable[..., str], finished: Path) -> None:
+def test_an_output_that_is_an_input(refused: Callable[..., str], finished: Path, tmp_path: Path) -> None:
     for name in ("model.safetensors", "run.json"):
         refused(f"probe {finished} --json {finished / name}", "would overwrite what the command reads")
     refused(f"bench board {finished}/run.json --out {finished}/run.json", "would overwrite what the command reads")
@@ -396,6 +402,20 @@ def test_an_output_that_is_an_input(refused: Callable[..., str], finished: Path)
     refused(f"predict e {table} --out {frame}", "would overwrite what the command reads")
     (frame.with_name("look.png")).touch()  # beside a table, that of last time
     refused(f"predict e {table} --out {frame.with_name('look.png')}", "no trained model at e")
+    pq.write_table(pa.table({"touch": ["../frames/3.png"]}), frame.with_name("t.parquet"))
+    refused(f"data check {frame.with_name('t.parquet')} --sheet {frame}", "would overwrite what the command reads")
+    times, log = frame.with_name("press_timestamps.csv"), frame.with_name("press_force.csv")
+    for name in (times, log):
+        name.touch()
+        refused(
+            f"predict e press.mp4 --log {{}}_force.csv:stamp --out {name}", "would overwrite what the command reads"
+        )
+    refused("probe {run} --json {pack}/pack.json", "would overwrite what the command reads")  # it was trained on
+    refused("find x.png --model {run} --known k --json o.png --sheet ./o.png", "is the place of another output")
+    (loop := tmp_path / "loop").symlink_to(loop)
+    refused(f"probe {finished} --json {loop}", "cannot be written: Too many levels of symbolic links")
+    refused(f"bench board {finished}/run.json --out {{tmp}}", "is a folder")
+    refused("export {run} --out .", ". already exists: choose another place")
     (link := frame.with_name("link")).symlink_to(finished / "run.json")
     refused(f"probe {finished} --json {link}", "would overwrite what the command reads")
     refused(f"find x.png --model {finished} --known k --sheet {finished}/pack.json", "give the name of a .png file")

@@ -458,7 +458,7 @@ BAD: dict[str, tuple[Change | None, dict[str, Any], str]] = {
     "empty split": (one(5, side=""), {"split": "side"}, r"row 5 .*'side' \(split\) is empty"),
     "validation": (one(13, side="validation"), {"split": "side"}, r"unknown split in column 'side' 'validation': "),
     "control character": (one(13, object="a\x93"), {}, r"control character in a name, .*a\\x93"),
-    "escape": (one(13, material="\x1b[2J"), {}, r"control character in a name, .*u001b"),
+    "escape": (one(13, material="\x1b[2J"), {}, r"row 13, column 'material': control character in a name, .*x1b"),
     "leak of a touch": (each(seq=0), {"touch_group": "seq"}, r"1 of 1 touch groups are.*give the group"),
     "leak of an image": (each(vision="vision/00.png"), {}, r"1 of 1 vision images are in more than one split"),
     "nothing to train on": (each(side="test"), {"split": "side"}, r"'side' gives no rows of train"),
@@ -504,7 +504,8 @@ BAD_FILES: dict[str, tuple[str, bytes, str]] = {
     "two open quotes": ("m.csv", b'vision,touch\na,b\na,"b\na,"b\n', "expected after"),
     "swallowed row": ("m.csv", b'vision,touch\na,"b\na,b"\n', "row 1 has a line break in a cell"),
     "header twice": ("m.csv", b"vision,vision\na,b\n", "two columns of one name"),
-    "key twice": ("m.jsonl", b'{"vision": "a", "touch": "b", "touch": "c"}', "two entries of one name"),
+    "key twice": ("m.jsonl", b'{"vision": "a", "touch": "b", "touch": "c"}', "line 1: two entries of one name"),
+    "broken line": ("m.jsonl", b'{"touch": "b"}\n\n{"touch": "b",}', "line 3: Expecting property name"),
     "latin-1": ("m.csv", "vision,touch\nMöbel,b\n".encode("latin-1"), "cannot be read as a table: 'utf-8' codec"),
 }
 
@@ -531,7 +532,7 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
         ("half flat", ["touch/1.png", "touch/a/2.png"], r"1\.\* is not in a class folder"),
         ("twins", ["touch/a/1.png", "touch/a/1.bmp"], "differ in their suffix only"),
         ("beside", ["train/a/1.png", "test/b/2.png", "validation/a/3.png"], "images in validation beside train, test:"),
-        ("latin", latin, "control character in a name, "),
+        ("latin", latin, "row 10, column 'touch': control character in a name, "),
     ):
         for name in names:
             picture(tmp_path / folder / name)

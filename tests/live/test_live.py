@@ -452,6 +452,18 @@ def test_a_run_is_exported_again_for_other_data(
     assert len(made) == 3
 
 
+def test_a_recording_is_kept_when_the_summary_cannot_be_written(
+    onnx: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mvitac.cli.live.write_json", lambda path, value: path.open("w").write(value))
+    places = ["--record", str(tmp_path / "r"), "--json", str(tmp_path / "new" / "s.json")]
+    assert main(["live", str(onnx), "--always", "--seconds", "2", *places]) == 2
+    assert "No such file" in capsys.readouterr().err and Pack(tmp_path / "r").num > 0
+    (tmp_path / "free.png").write_bytes(b"")
+    background = ["--background", str(tmp_path / "free.png"), "--calibration", "9"]
+    assert main(["live", str(onnx), *background]) == 2 and "has no effect beside" in capsys.readouterr().err
+
+
 def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Threads, files and lines of JSON together; ends when the files do."""
     command = ["live", str(onnx), *film(pack, tmp_path, rest=12, num=24, fps=20)]

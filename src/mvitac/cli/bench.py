@@ -12,12 +12,13 @@ from mvitac.bench.board import write_board
 from mvitac.bench.encoder import About, run_bench
 from mvitac.bench.result import problems, read_result, records_of
 from mvitac.bench.suite import find_suite, shipped
-from mvitac.cli.options import parse
+from mvitac.cli.options import check_json, parse
 from mvitac.control import result as loop
 from mvitac.evaluation.leaks import leaks_of
 from mvitac.evaluation.scores import summarise
+from mvitac.registry import check_known
 from mvitac.report.tables import print_summary
-from mvitac.system.files import check_place, fields_of
+from mvitac.system.files import fields_of
 from mvitac.system.progress import shown
 
 
@@ -62,11 +63,15 @@ _MANUAL = """Score an encoder on every task of a suite, beside the same controls
 
 def bench(argv: list[str]) -> None:
     """mvitac bench MODEL... --suite NAME [--out DIR] [--data-root DIR]"""
-    suites = ", ".join([*shipped(), *loop.shipped()])
-    options = parse(_Options, argv, "bench", description=_MANUAL.format(suites=suites))
+    suites = [*shipped(), *loop.shipped()]
+    options = parse(_Options, argv, "bench", description=_MANUAL.format(suites=", ".join(suites)))
     if not options.models:
         raise ValueError("name the encoder: the folder of a run or an artifact (see mvitac bench --help)")
+    if not options.suite.endswith(".toml"):
+        check_known("suite", [options.suite], [*suites, "FILE.toml"])
     if options.suite in loop.shipped():
+        if options.data_root:
+            raise ValueError(f"--data-root has no effect on {options.suite}, which is simulated: leave it out")
         with shown():
             path = loop.run_suite(options.models, loop.find_suite(options.suite), options.out, options.about)
         own, value = loop.read_control(path)
@@ -91,7 +96,7 @@ def bench(argv: list[str]) -> None:
 def board(argv: list[str]) -> None:
     """mvitac bench board FILE... [--out FILE.html]"""
     options = parse(_BoardOptions, argv, "bench board")
-    check_place(options.out)
+    check_json(options.out, "--out")
     write = loop.write_page if loop.is_result(options.files[0]) else write_board
     print(f"written: {write(options.files, options.out)}")
 

@@ -8,6 +8,7 @@ from tyro.conf import Positional
 from mvitac.cli.options import check_models, loading, parse
 from mvitac.data.pack import Pack
 from mvitac.deploy.export_config import ExportConfig
+from mvitac.system.locks import check_new
 from mvitac.system.progress import shown
 
 
@@ -62,6 +63,7 @@ def export(argv: list[str]) -> None:
     """mvitac export RUN|ARTIFACT --out DIR [--precision fp32|bf16|int8]"""
     options = parse(_ExportOptions, argv, "export")
     check_models(options.model)
+    check_new(options.out)
     loading()
     from mvitac.deploy.artifact import load
     from mvitac.deploy.export import export

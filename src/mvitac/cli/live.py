@@ -51,6 +51,8 @@ class _Common:
     live: Annotated[LiveConfig, tyro.conf.arg(name="")] = LiveConfig()
 
     def free(self) -> list[np.ndarray]:
+        if self.background and self.live.calibration != LiveConfig.calibration:
+            raise ValueError("--calibration has no effect beside --background: leave one out")
         return [np.array(decode(file)) for file in self.background]
 
 
@@ -109,10 +111,12 @@ def live(argv: list[str]) -> None:
     if any(contact.background is None for contact in loop.contacts.values()):
         _say(f"contact was never known: no {options.live.calibration} frames without it, and no --background")
     _say(f"summary: {json.dumps(loop.summary())}")
-    if options.json:
-        write_json(options.json, loop.summary())
-    if recorder:  # last, for it may fail (a full disk)
-        num = recorder.close()
+    try:
+        num = recorder.close() if recorder else 0  # may fail (a full disk)
+    finally:
+        if options.json:
+            write_json(options.json, loop.summary())
+    if recorder:
         _say(f"recorded: {options.record}, {num} pairs" if num else "nothing was recorded")
 
 

@@ -4,12 +4,12 @@ A mistake of the user ends in one line on stderr and exit code 2, Ctrl-C in 130.
 """
 
 import importlib
-import itertools
 import os
 import re
 import shlex
 import sys
 from collections.abc import Sequence
+from fnmatch import fnmatch
 from pathlib import Path
 
 from mvitac import __version__
@@ -40,11 +40,6 @@ COMMANDS = {
 }
 """Command -> module of this package:function, imported when called."""
 
-OWN = (
-    *(".safetensors", ".npy", ".onnx", ".pt", "samples.parquet", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"),
-    *("run.json", "pack.json", "export.json", "artifact.json", "metadata.yaml"),
-    *(".mcap", ".db3", ".mp4", ".h5", ".hdf5"),
-)
 HEAVY = ("demo", "pretrain", "finetune", "compare", "bench")
 """Commands whose options need torch. The others import it once their options are known to be right."""
 
@@ -133,22 +128,46 @@ def _check_choices(rest: Sequence[str], text: Path) -> None:
 
 
 def _check_outputs(words: Sequence[str]) -> None:
-    """ValueError for an output that is an input, or a file with a name of ``OWN`` in such a folder, or in a table's text."""
+    """ValueError for one place of two outputs, and for an output over what the command may read.
+
+    That is an input, a file in a folder that is one or that a run was trained on, one that a table names, and what is read
+    beside a video (docs/datasets.md).
+    """
     places = [part for word in words for part in word.split("=")]
-    for at, (option, out) in enumerate(itertools.pairwise(places)):
-        if option in ("--out", "--json", "--sheet") and os.path.isfile(out):
-            others = (*places[: at + 1], *places[at + 2 :])
-            parts = [
-                part for each in others for part in (re.sub(r"(@[\d.]+)?(#.*)?$", "", each), *re.split("[,:]", each))
-            ]
-            inputs = [place for place in parts if os.path.exists(place)]
-            file = Path(out).resolve()
-            own = [Path(place).resolve() for place in inputs if file.name.lower().endswith(OWN)]
-            tables = [place for place in own if place.is_file() and place.suffix in (".csv", ".jsonl")]
-            inside = any(place in file.parents for place in own)
-            listed = any(file.name.encode() in table.read_bytes() for table in tables)
-            if inside or listed or any(os.path.samefile(out, place) for place in inputs):
-                raise ValueError(f"{option} {out} would overwrite what the command reads: choose another file")
+    outputs = {i + 1: word for i, word in enumerate(places[:-1]) if word in ("--out", "--json", "--sheet", "--record")}
+    others = [re.sub(r"(@[\d.]+)?(#.*)?$", "", place) for i, place in enumerate(places) if i not in outputs]
+    parts = [*others, *(part for place in others for part in re.split("[,:]", place))]
+    beside = [
+        Path(part).name.replace("{}", "*") if "{}" in part else f"{Path(part).stem}_timestamps.*" for part in parts
+    ]
+    seen: set[Path] = set()
+    for i, option in outputs.items():
+        file = Path(os.path.realpath(places[i]))
+        if file in seen:
+            raise ValueError(f"{option} {places[i]} is the place of another output: give another")
+        seen.add(file)
+        if not file.is_file():
+            continue
+        texts = [_names(Path(part)) for part in parts]
+        named = [Path(name) for text in texts for name in re.findall(r'"(?:path|pack)": "([^"]+)"', text)]
+        inputs = [Path(os.path.realpath(place)) for place in (*parts, *named) if os.path.exists(place)]
+        read = {file, *file.parents} & {*inputs} or any(os.path.samefile(file, place) for place in inputs)
+        if read or any(file.name in text for text in texts) or any(fnmatch(file.name, each) for each in beside):
+            raise ValueError(f"{option} {places[i]} would overwrite what the command reads: choose another file")
+
+
+def _names(place: Path) -> str:
+    """The text of a table or of a run's configuration, which may name data; "" of other places."""
+    place = place / "run.json" if (place / "run.json").is_file() else place
+    if place.suffix in (".csv", ".jsonl", ".json") and place.is_file():
+        return place.read_text(errors="replace")
+    if place.suffix != ".parquet" or not place.is_file():
+        return ""
+    import pyarrow.parquet as pq
+
+    schema = pq.read_schema(place)
+    texts = pq.read_table(place, columns=[field.name for field in schema if str(field.type) == "string"])
+    return f"{texts.to_pydict()} {(schema.metadata or {}).values()}"
 
 
 def help_file(command: str) -> Path:

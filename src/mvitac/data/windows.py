@@ -95,7 +95,7 @@ def frames_of(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray, np.nd
         whole[rows] = asked[:, -1] >= times[0] - 1e-9
         first[rows] = rows[0]
     if not whole.any():
-        raise ValueError(f"frames {window.frames} at stride {window.stride:g} are longer than every touch")
+        raise ValueError(f"{pack.path}: frames {window.frames} at stride {window.stride:g} are longer than every touch")
     return index, whole, first
 
 

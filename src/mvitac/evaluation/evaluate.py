@@ -313,4 +313,7 @@ def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[AnyTask], list[str]]:
     check_known("task", session.tasks, known)
     have = [*pack.spec.modalities, *["both"] * (len(pack.spec.modalities) == 2)]
     check_known("modality", session.modalities, have)
-    return [known[name] for name in session.tasks or known], list(session.modalities or have)
+    tasks = [known[name] for name in session.tasks or known]
+    if not any(probes_of(task, session.kinds) for task in tasks):
+        raise ValueError(f"probe {', '.join(session.kinds)} is for classes, these are values: give linear or knn")
+    return tasks, list(session.modalities or have)

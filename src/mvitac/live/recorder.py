@@ -16,8 +16,8 @@ import numpy as np
 from mvitac.data.build import build
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec
-from mvitac.system.files import brief, check_place, digest_file, write_atomic
-from mvitac.system.locks import hold_lock
+from mvitac.system.files import brief, digest_file, write_atomic
+from mvitac.system.locks import check_new, hold_lock
 
 SPOOL = 64  # pairs per file of the spool: the number that a crash can lose
 
@@ -27,9 +27,7 @@ class Recorder:
 
     def __init__(self, out: Path, *, fps: float = 10, sensor: str = "", tell: Callable[[str], object] = print) -> None:
         """Record into the new folder ``out``; ``sensor`` is the touch sensor's name, if it is known (column sensor)."""
-        if out.exists():
-            raise ValueError(f"{out} already exists: choose another --record, or delete it first")
-        check_place(out)
+        check_new(out)
         self.out, self.every, self.tell, self.failed = out, 1 / fps, tell, False
         self.named = {"sensor": sensor} if sensor else {}
         self.spool = _spool(out)

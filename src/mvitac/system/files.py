@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import re
+import stat
 import tempfile
 import time
 import uuid
@@ -64,7 +65,11 @@ def naming(path: Path) -> Iterator[None]:
 
 def check_ordinary(path: Path) -> None:
     """Raise ValueError if ``path`` is there and neither file nor folder: a rename would put a file in a device's place."""
-    if path.exists() and not (path.is_file() or path.is_dir()):
+    try:
+        kind = stat.S_IFMT(path.stat().st_mode)  # OSError for a link to itself
+    except FileNotFoundError:
+        return
+    if kind not in (stat.S_IFREG, stat.S_IFDIR):
         raise ValueError(f"{path} is neither a file nor a folder: choose another place")
 
 
@@ -123,7 +128,7 @@ def fields_of(files: Path | str) -> Iterator[None]:
         raise ValueError(f"{files} is damaged: a field is missing or of another kind ({what}): make it again") from None
 
 
-_CONTROL = re.compile(
+CONTROL = re.compile(
     r"\\u00(?:0[0-8bcef]|1.|7f|[89].)|\\u20(?:2[a-e]|6[6-9])|[\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
 )
 """What begins an escape sequence or turns text around, as itself or as JSON writes it: names may be a stranger's."""
@@ -131,7 +136,7 @@ _CONTROL = re.compile(
 
 def parse_json(text: str) -> Any:
     """Parse JSON; ValueError if it is invalid, nested more deeply than Python can read, or holds a control character."""
-    if found := _CONTROL.search(text):
+    if found := CONTROL.search(text):
         name = text[max(0, found.start() - 20) : found.end()]
         raise ValueError(f"control character in a name, {name!r}: rename it, a terminal would obey it")
     try:

@@ -51,12 +51,11 @@ def new_folder(out: Path) -> Iterator[Path]:
 
     Raises Busy if another process writes ``out``, ValueError if it exists or cannot be written.
     """
-    check_place(out)
+    check_new(out)
     with hold_lock(out, f"{out} is being written by another process: wait, or choose another", wait=False) as left:
         partial = out.with_name(out.name + ".partial")
         for place in (out, *[partial] * (not left)):
-            if os.path.lexists(place):
-                raise ValueError(f"{place} already exists: choose another place, or delete it first")
+            check_new(place)
         shutil.rmtree(partial, ignore_errors=True)  # of a process that was killed
         partial.mkdir(parents=True)
         try:
@@ -65,3 +64,10 @@ def new_folder(out: Path) -> Iterator[Path]:
             os.rename(partial, out)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
+
+
+def check_new(place: Path) -> None:
+    """ValueError if ``place`` exists, or cannot be written."""
+    check_place(place)
+    if os.path.lexists(place):
+        raise ValueError(f"{place} already exists: choose another place, or delete it first")

@@ -5,6 +5,7 @@ Rows are counted from 1, without the header.
 """
 
 import csv
+import json
 import math
 import os
 import re
@@ -22,7 +23,7 @@ import pyarrow.parquet as pq
 from mvitac.data.video import VIDEOS
 from mvitac.datasets.table.image_refs import Frame, ImageRef
 from mvitac.registry import unknown
-from mvitac.system.files import brief, digest, digest_file, parse_json
+from mvitac.system.files import CONTROL, brief, digest, digest_file, parse_json
 
 NAN = ("nan", "NaN", "NAN")  # how programs write a missing number. "Nan" is a name.
 Row = dict[str, str]
@@ -84,6 +85,11 @@ class Manifest:
                 for name in {column, column.partition("[")[0]} & self.left_out.keys():
                     raise ValueError(f"{self.path}: {name} {self.left_out[name]}")
                 raise ValueError(f"{self.path}: {unknown('column', column, self.columns)}")
+            cells = [row.get(column or "", "") for row in self.rows]
+            if bad := {cell for cell in {*cells} if CONTROL.search(json.dumps(cell, ensure_ascii=False))}:
+                row, cell = next(each for each in zip(self.numbers, cells, strict=True) if each[1] in bad)
+                where = f"{self.path} row {row}, column {column!r}"
+                raise ValueError(f"{where}: control character in a name, {cell!r}: rename it, a terminal would obey it")
 
     def at(self, i: int) -> str:
         """Name row index ``i`` in an error: nobody counts rows, so its id or first image is said too."""
@@ -208,9 +214,14 @@ def _read_parquet(file: Path) -> list[dict[str, Any]]:
 
 
 def _read_jsonl(file: Path) -> list[dict[str, Any]]:
-    rows = [parse_json(line) for line in file.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
-    if not all(isinstance(row, dict) for row in rows):
-        raise ValueError("write one object {...} per line")
+    rows = []
+    for number, line in enumerate(file.read_text(encoding="utf-8-sig").split("\n"), 1):
+        try:
+            rows += [parse_json(line)] if line.strip() else []
+        except ValueError as error:
+            raise ValueError(f"line {number}: {str(error).partition(': line 1')[0]}") from None
+        if rows and not isinstance(rows[-1], dict):
+            raise ValueError(f"line {number}: write one object {{...}} per line")
     return rows
 
 

@@ -210,7 +210,7 @@ class Rows(Source):
         targets = [target.name for task in value_tasks for target in task.targets]
         used = (*label_columns, *targets, self._group, *({self._split} - {BY_GROUP}), self._sensor, config.touch_group)
         used += (*config.conditioned(), *(c for used in config.control_columns().values() for c in used))
-        table.check(*used)
+        table.check(*used, *{"id"} & {*table.columns})
 
         table, grounds = self._select(table)
         asked = {"vision": self._images[: bool(self._vision)], "touch": self._touch}
