@@ -391,35 +391,35 @@ def test_an_option_given_twice(refused: Callable[..., str], finished: Path) -> N
 
 def test_an_output_that_is_an_input(refused: Callable[..., str], finished: Path, tmp_path: Path) -> None:
     for name in ("model.safetensors", "run.json"):
-        refused(f"probe {finished} --json {finished / name}", "would overwrite what the command reads")
-    refused(f"bench board {finished}/run.json --out {finished}/run.json", "would overwrite what the command reads")
+        refused(f"probe {finished} --json {finished / name}", "may be what the command reads")
+    refused(f"bench board {finished}/run.json --out {finished}/run.json", "may be what the command reads")
     (finished / "policy.py").touch()
     (finished / "frames").mkdir(exist_ok=True)
     (frame := finished / "frames" / "3.png").write_bytes(b"0")
     for source in ("frames", "frames@30", "frames@30#0:0:9:9", "."):
-        refused(f"predict e {finished}/{source} --out {frame}", "would overwrite what the command reads")
+        refused(f"predict e {finished}/{source} --out {frame}", "may be what the command reads")
     (table := frame.with_name("t.csv")).write_text("touch\nframes/3.png\n")
-    refused(f"predict e {table} --out {frame}", "would overwrite what the command reads")
+    refused(f"predict e {table} --out {frame}", "may be what the command reads")
     (frame.with_name("look.png")).touch()  # beside a table, that of last time
     refused(f"predict e {table} --out {frame.with_name('look.png')}", "no trained model at e")
     pq.write_table(pa.table({"touch": ["../frames/3.png"]}), frame.with_name("t.parquet"))
-    refused(f"data check {frame.with_name('t.parquet')} --sheet {frame}", "would overwrite what the command reads")
+    refused(f"data check {frame.with_name('t.parquet')} --sheet {frame}", "may be what the command reads")
     times, log = frame.with_name("press_timestamps.csv"), frame.with_name("press_force.csv")
     for name in (times, log):
         name.touch()
         refused(
-            f"predict e press.mp4 --log {{}}_force.csv:stamp --out {name}", "would overwrite what the command reads"
+            f"predict e press.mp4 --log {{}}_force.csv:stamp --out {name}", "may be what the command reads"
         )
-    refused("probe {run} --json {pack}/pack.json", "would overwrite what the command reads")  # it was trained on
+    refused("probe {run} --json {pack}/pack.json", "may be what the command reads")  # it was trained on
     refused("find x.png --model {run} --known k --json o.png --sheet ./o.png", "is the place of another output")
     (loop := tmp_path / "loop").symlink_to(loop)
     refused(f"probe {finished} --json {loop}", "cannot be written: Too many levels of symbolic links")
     refused(f"bench board {finished}/run.json --out {{tmp}}", "is a folder")
     refused("export {run} --out .", ". already exists: choose another place")
     (link := frame.with_name("link")).symlink_to(finished / "run.json")
-    refused(f"probe {finished} --json {link}", "would overwrite what the command reads")
+    refused(f"probe {finished} --json {link}", "may be what the command reads")
     refused(f"find x.png --model {finished} --known k --sheet {finished}/pack.json", "give the name of a .png file")
-    refused(f"ablate {finished}/policy.py:act --data a --json {finished}/policy.py", "would overwrite what the command")
+    refused(f"ablate {finished}/policy.py:act --data a --json {finished}/policy.py", "may be what the command")
 
 
 def fill_disk(monkeypatch: pytest.MonkeyPatch, name: str) -> None:

@@ -1,5 +1,6 @@
 """``mvitac publish`` and ``export``: a trained model for other people and other engines."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,7 +40,7 @@ def publish(argv: list[str]) -> None:
         pack = Pack(options.on) if options.on else None
         out = publish.publish(options.run, options.out, pack, allow_leak=options.allow_leak)
     print_summary(ARTIFACT.read(out)["scores"])
-    print(f"written: {out}\nto the Hub: hf upload OWNER/NAME {out}")
+    print(f"written: {out}\nto the Hub: hf upload OWNER/NAME {shlex.quote(str(out))}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,5 +1,6 @@
 """``mvitac finetune``."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -63,5 +64,6 @@ def next_step(result: dict[str, Any], fraction: float) -> str:
         ours, theirs = ([r for r in last if (r["task"], r["source"]) == (task, name)] for name in (TUNED, FROZEN))
         gains.append(paired_difference(ours, theirs))
     if any(low > 0 for _, low, *_ in gains) and not any(high < 0 for _, _, high, _ in gains):
-        return f"next: mvitac publish {result['models'][-1]} ARTIFACT\n  (it fits probes of its own, on all labels)"
+        model = shlex.quote(str(result["models"][-1]))
+        return f"next: mvitac publish {model} ARTIFACT\n  (it fits probes of its own, on all labels)"
     return "no gain over the frozen probe is sure: keep the model as it is, and publish or probe that"

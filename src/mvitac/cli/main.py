@@ -153,7 +153,7 @@ def _check_outputs(words: Sequence[str]) -> None:
         inputs = [Path(os.path.realpath(place)) for place in (*parts, *named) if os.path.exists(place)]
         read = {file, *file.parents} & {*inputs} or any(os.path.samefile(file, place) for place in inputs)
         if read or any(file.name in text for text in texts) or any(fnmatch(file.name, each) for each in beside):
-            raise ValueError(f"{option} {places[i]} would overwrite what the command reads: choose another file")
+            raise ValueError(f"{option} {places[i]} may be what the command reads: choose another place")
 
 
 def _names(place: Path) -> str:

@@ -1,5 +1,6 @@
 """``mvitac pretrain``."""
 
+import shlex
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -62,7 +63,7 @@ def pretrain(argv: list[str]) -> None:
         out = train(options.run, options.out, resume=options.resume, quiet=options.quiet, loggers=loggers, pack=pack)
     data = load_run(out)[1].get("data", {})
     known = "probe" if data.get("tasks") or data.get("values") else "report"
-    print(f"trained: {out}\nnext: mvitac {known} {out}")
+    print(f"trained: {out}\nnext: mvitac {known} {shlex.quote(str(out))}")
 
 
 def _chosen_run(chosen: dict[str, str], rest: list[str], phased: bool) -> Run:
