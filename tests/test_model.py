@@ -18,7 +18,7 @@ from mvitac.data.pack import Pack
 from mvitac.evaluation.features import pack_features
 from mvitac.methods.calandra import CalandraConfig
 from mvitac.model import Model, fresh
-from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD, plain_view
+from mvitac.transforms.random_views import IMAGENET, plain_view
 from support.toy import toy_pack
 from support.training_runs import smoke
 
@@ -170,7 +170,7 @@ def test_trunk_is_a_plain_timm_model(pack: Pack, tmp_path: Path) -> None:
     before = [type(layer) for layer in model.modules()]
     trunk = model.trunk("touch")
     config = timm.data.resolve_model_data_config(trunk)
-    assert (config["input_size"], config["mean"], config["std"]) == ((3, 24, 24), IMAGENET_MEAN, IMAGENET_STD)
+    assert (config["input_size"], config["mean"], config["std"]) == ((3, 24, 24), *IMAGENET)
     assert trunk.num_features == 512 and trunk.pretrained_cfg["num_classes"] == 0
     kinds, theirs = ({type(m) for m in net.modules()} for net in (trunk, timm.create_model("resnet10t")))
     assert kinds == theirs - {torch.nn.Linear} | {torch.nn.Identity}
@@ -189,7 +189,7 @@ def test_trunk_of_two_sensors_has_six_channels(tmp_path: Path) -> None:
     pack = toy_pack(tmp_path / "p", touch_channels=6, num=12)
     model = fresh(smoke(pack), pack.spec, 32)
     cfg = model.trunk("touch").pretrained_cfg
-    assert cfg["input_size"] == (6, 32, 32) and cfg["mean"] == IMAGENET_MEAN * 2 and len(cfg["std"]) == 6
+    assert cfg["input_size"] == (6, 32, 32) and cfg["mean"] == IMAGENET[0] * 2 and len(cfg["std"]) == 6
     streams = replace(model.run, method=CalandraConfig())
     with pytest.raises(ValueError, match="no single timm model but a Streams"):
         fresh(streams, pack.spec, 32).trunk("touch")

@@ -37,7 +37,7 @@ def test_commands_know_base(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert found.runs == (BASE,) and found.config.tasks == ("feel", "base")
     run = replace(mvitac.recipe("locked"), init=mvitac.Init(path=Path("base")))
     start = read_start(run.init)
-    assert start is not None and set(start.trunks) == {"vision", "touch"}
+    assert start is not None and set(start.model.encoders) == {"vision", "touch"}
 
 
 def test_base_is_exported_on_a_few_rows_and_only_if_it_can_be_used(

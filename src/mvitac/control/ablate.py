@@ -328,7 +328,6 @@ def verdict(sense: str, rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def report(result: Mapping[str, Any]) -> str:
-    """The result as text."""
     rows, text = result["rows"], "{0:.2f} [{1:.2f}, {2:.2f}]".format
     lines = [[r["sense"], r["kind"], text(*r["change"]), text(*r["error"]), f"{r['error'][3]:.2g}"] for r in rows]
     about = [f"{result['episodes']} episodes{result['of']}, error {text(*result['error'])}, in {result['unit']}"]

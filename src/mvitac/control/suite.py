@@ -60,7 +60,6 @@ class LoopSuite:
     """Digests of what is learned from, where the suite was measured. Not in the digest of the definition."""
 
     def definition(self) -> dict[str, Any]:
-        """The suite as JSON, without its pins."""
         return {name: value for name, value in to_json(self).items() if name != "pins"}
 
     def digest(self) -> str:

@@ -75,7 +75,6 @@ class Constant:
         return np.eye(self.num_classes)[np.full(len(z), self.label)]
 
     def weights(self) -> tuple[np.ndarray, np.ndarray]:
-        """As of ``Logistic``."""
         bias = np.where(np.arange(self.num_classes) == self.label, 0.0, UNSEEN)
         return np.zeros((self.num_classes, self.width)), bias
 

@@ -75,14 +75,11 @@ def probe_runs(
     ``weights`` are those after the last step, or the best on split val, whose result is in probe.best.json; that of folds
     is in probe.folds.json. ``encoders`` are other people's to probe beside the runs ("external:..."); they need ``pack``.
 
-    Returns:
-        A dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary",
-        "per_class", "asked" (the config), "models" (digests of the weights) and "encoders" (``ExternalModel.describe``).
-        A record has a "leak", which is empty unless its test rows, or their groups, were trained on.
-
-    Raises:
-        ValueError: If a path is no run, a run is given twice, the runs and the data do not fit together, or a run was
-            trained on rows or groups that other data than its own would score.
+    Returns a dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary",
+    "per_class", "asked" (the config), "models" (digests of the weights) and "encoders" (``ExternalModel.describe``). A
+    record has a "leak", which is empty unless its test rows, or their groups, were trained on. ValueError if a path is no
+    run, a run is given twice, the runs and the data do not fit together, or a run was trained on rows or groups that other
+    data than its own would score.
     """
     _check_paths(paths, encoders)
     others = open_encoders(encoders, pack)
@@ -288,9 +285,8 @@ def check_unseen(
 ) -> list[list[Source] | None]:
     """What each run at ``paths`` learned from; None where that is not known.
 
-    Raises:
-        ValueError: If a run, or a model whose weights it started from, saw what would be scored. What a run itself saw of
-            its own data follows from the split that was chosen, so there the scores only say LEAK.
+    ValueError if a run, or a model whose weights it started from, saw what would be scored. What a run itself saw of its
+    own data follows from the split that was chosen, so there the scores only say LEAK.
     """
     scored, sources = Scored(pack), []
     for path in paths:

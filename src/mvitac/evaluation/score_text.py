@@ -41,9 +41,9 @@ def score_name(task: dict[str, Any]) -> str:
     return "R2" if any("targets" in cell for cells in task.values() for cell in cells.values()) else "accuracy"
 
 
-def error_text(target: dict[str, Any], key: str = "mae") -> str:
-    """An error of one target with its unit, such as '0.41 N'."""
-    return f"{target[key]:.3g} {target['unit']}"
+def error_text(target: dict[str, Any]) -> str:
+    """The mean absolute error of one target with its unit, such as '0.41 N'."""
+    return f"{target['mae']:.3g} {target['unit']}"
 
 
 def clipped_text(task: dict[str, Any]) -> str:

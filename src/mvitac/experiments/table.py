@@ -26,7 +26,6 @@ class Line:
 
 
 def plan_of(result: dict[str, Any]) -> Plan:
-    """The plan of a result."""
     return from_json(Plan, result["plan"], "plan")
 
 

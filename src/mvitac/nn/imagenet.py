@@ -63,8 +63,7 @@ def load(trunk: str, arguments: dict[str, Any]) -> nn.Module:
 
 
 def _hub(trunk: str) -> str | None:
-    known = timm.get_pretrained_cfg(trunk)
-    return known.hf_hub_id if known else None
+    return getattr(timm.get_pretrained_cfg(trunk), "hf_hub_id", None)
 
 
 def _is_cached(trunk: str) -> bool:

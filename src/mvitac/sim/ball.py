@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.sim.gel import F, relax, render
+from mvitac.sim.gel import F, axes_mm, relax, render
 from mvitac.sim.measured import BALL_MM, MM
 from mvitac.sim.sensors import Sensor
 
@@ -24,8 +24,8 @@ def depth_mm(radius_mm: float) -> float:
 def imprint(pixels: int, x_mm: float, y_mm: float, radius_mm: float) -> F:
     """Return the imprint [pixels, pixels] in mm of the ball at (x, y) from the middle of the picture."""
     pixel = FIELD_MM / pixels
-    axis = (np.arange(pixels, dtype=np.float32) - np.float32((pixels - 1) / 2)) * np.float32(pixel)
-    away = (axis[None] - np.float32(x_mm)) ** 2 + (axis[:, None] - np.float32(y_mm)) ** 2
+    x, y = axes_mm((pixels, pixels), pixel)
+    away = (x - np.float32(x_mm)) ** 2 + (y - np.float32(y_mm)) ** 2
     indent = np.sqrt(np.maximum(BALL_MM**2 - away, 0)) - (BALL_MM - depth_mm(radius_mm))
     return relax(np.maximum(indent, 0).astype(np.float32), pixel_mm=pixel)
 

@@ -50,7 +50,7 @@ def pressure(
     """
     height = np.array(relief_mm, np.float64)
     if dome_radius_mm is not None:  # a domed gel touches first at its centre
-        x, y = _axes_mm(height.shape, pixel_mm)
+        x, y = axes_mm(height.shape, pixel_mm)
         height -= (x * x + y * y) / (2 * dome_radius_mm)
     # -inf means "no object here"; a gap of 50 mm is equivalent and keeps the arithmetic finite
     gap = np.minimum(height.max() - height, 50.0)
@@ -179,7 +179,7 @@ def _shadow(imprint: F, towards: Pair, pixel_mm: float) -> F:
 
 def _draw_markers(picture: F, imprint: F, sensor: Sensor, copy: Rng, pixel_mm: float, shear_mm: Pair) -> None:
     """Draw the dots into levels [H, W, 3] in place. They move with the gel, so contact drags and spreads them."""
-    x, y = _axes_mm(imprint.shape, pixel_mm)
+    x, y = axes_mm(imprint.shape, pixel_mm)
     push = _blur(imprint, 0.8 / pixel_mm)
     grip = push / (push + np.float32(0.08))
     spread_y, spread_x = np.gradient(push, np.float32(pixel_mm))
@@ -222,7 +222,7 @@ def _disc(square: F, soft: F | np.float32) -> F:
 def _soil(picture: F, sensor: Sensor, copy: Rng, pixel_mm: float) -> None:
     """Add dirt, scratches and the lens edge to levels [H, W, 3] in place."""
     h, w = picture.shape[:2]
-    x, y = _axes_mm((h, w), pixel_mm)
+    x, y = axes_mm((h, w), pixel_mm)
     reach = 3 * max(pixel_mm, 0.12)
     for _ in range(copy.poisson(sensor.dirt)):
         cx, cy = copy.uniform(-0.5, 0.5, 2) * (w, h) * pixel_mm
@@ -261,13 +261,12 @@ def grid(size: int, width_mm: float) -> tuple[F, F, float]:
     """Return x, y [n, n] in mm and mm per pixel of the internal picture, which is twice as fine if `size` is small."""
     n = 2 * size if size <= 96 else max(192, size)
     pixel = width_mm / n
-    axis = (np.arange(n, dtype=np.float32) - (n - 1) / 2) * np.float32(pixel)
-    x, y = np.meshgrid(axis, axis)
+    x, y = np.meshgrid(*axes_mm((n, n), pixel))
     return x, y, pixel
 
 
 @lru_cache(maxsize=16)
-def _axes_mm(shape: tuple[int, ...], pixel_mm: float) -> tuple[F, F]:
+def axes_mm(shape: tuple[int, ...], pixel_mm: float) -> tuple[F, F]:
     """Return x [1, W] and y [H, 1] in mm from the centre of the picture."""
     h, w = shape
     x, y = ((np.arange(n, dtype=np.float32) - (n - 1) / 2) * np.float32(pixel_mm) for n in (w, h))

@@ -80,9 +80,9 @@ class Instance:
     def __init__(self, seed: int, category: int, instance: int) -> None:
         """Draw the object, which depends on the three numbers only."""
         rng, m = np.random.default_rng([_TAG, seed, category, instance]), MATERIALS[category]
-        soft, rough = rng.random() < m.soft, rng.random() < m.rough
-        decades = rng.uniform(0.1, 0.6) if soft else -rng.uniform(0.1, 1.6)
-        asperity = rng.uniform(0.3, 0.85) * (1 if rough else -1)
+        self.soft, self.rough = rng.random() < m.soft, rng.random() < m.rough
+        decades = rng.uniform(0.1, 0.6) if self.soft else -rng.uniform(0.1, 1.6)
+        asperity = rng.uniform(0.3, 0.85) * (1 if self.rough else -1)
         wavelength = np.exp(rng.uniform(*np.log(m.wavelength_mm)))
         shared: Any = {"anisotropy": rng.uniform(*m.anisotropy), "irregularity": rng.uniform(*m.irregularity)}
         ratio = rng.uniform(6.0, 9.0)
@@ -98,14 +98,6 @@ class Instance:
         # The second colour follows the relief with either sign.
         self.ink = np.clip(colour * np.exp(rng.normal(0, 0.25, 3)), 0.05, 0.9).astype(np.float32)
         self.contrast = rng.uniform(-0.6, 0.6)
-
-    @property
-    def soft(self) -> bool:
-        return self.stiffness < SOFT_BELOW
-
-    @property
-    def rough(self) -> bool:
-        return self.feel.asperity > 0
 
     @property
     def curl(self) -> float:

@@ -26,12 +26,9 @@ RUNAWAY = 30.0  # a velocity (m/s or rad/s) that occurs only if the solver diver
 class Plan:
     """The parameters of one grasp."""
 
-    force_n: float
-    """Limit of the grip force, per finger."""
-    offset_m: tuple[float, float, float]
-    """Position of the grip in the object's frame, relative to the centre of its bounds."""
-    yaw: float
-    """Angle in radians between the object's long side and the pads."""
+    force_n: float  # limit of the grip force, per finger
+    offset_m: tuple[float, float, float]  # of the grip in the object's frame, from the centre of its bounds
+    yaw: float  # angle in radians between the object's long side and the pads
     lift_m: float
     friction: float
 
@@ -59,7 +56,7 @@ class Moment:
 def contact_radius_m(part: objects.Part, force_n: float, stiffness: float) -> float:
     """Return the radius of the contact between a pad and a part (Winkler: F = pi k R d^2, a^2 = 2 R d), at most the pad's.
 
-    ``stiffness`` is that of the part in N/mm^3. Part and gel are springs in series, as in :func:`mvitac.sim.gel.press`.
+    ``stiffness`` is that of the part in N/mm^3. Part and gel are springs in series, as in :func:`mvitac.sim.gel.pressure`.
     """
     spring = 1e9 * stiffness * gel.GEL_STIFFNESS / (stiffness + gel.GEL_STIFFNESS)
     return float(min((4 * force_n * part.pad_radius() / (np.pi * spring)) ** 0.25, objects.PAD_HALF_M))

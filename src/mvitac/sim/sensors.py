@@ -64,7 +64,6 @@ SENSORS: dict[str, Sensor] = {
             marker_jitter=0.025,
             marker_wear=0.2,
             dirt=8,
-            scratches=1.0,
             edge=0.25,
         ),
         Sensor(

@@ -80,7 +80,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     with nullcontext() if quiet or not world.is_main else shown():
         locked = _locked_features(run, pack, method, world)
     views = StepViews(run, pack, method.views, device, world, locked)
-    before = start.sensors if start and "touch" in taken["taken"] else ()
+    before = start.model.spec.sensors if start and "touch" in taken["taken"] else ()
     spec = replace(pack.spec, sensors=tuple(sorted({*sensors_of(pack, rows), *before})))
     setup = Setup(run, pack, rows, hardware, world, method, views, step, done, validation, spec)
     world.broadcast([*method.parameters(), *method.buffers()])

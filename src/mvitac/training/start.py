@@ -10,7 +10,7 @@ from torch import nn
 from mvitac.data.pack import Pack
 from mvitac.evaluation import leaks
 from mvitac.methods.base import Method
-from mvitac.model import BEST, load
+from mvitac.model import BEST, Model, load
 from mvitac.nn.encoders import within
 from mvitac.nn.initial import Init
 from mvitac.nn.momentum import Momentum
@@ -23,11 +23,8 @@ class Start:
     """What a run starts from."""
 
     init: Init
-    trunks: dict[str, State]  # modality -> state dict
-    heads: dict[str, State]  # modality -> state dict of the head into the shared space
-    trunk: str  # timm name of the trunks
+    model: Model
     sources: list[leaks.Source]  # what its weights were trained on
-    sensors: tuple[str, ...]  # touch sensors that they met, as far as the file says
 
 
 def read_start(init: Init) -> Start | None:
@@ -35,15 +32,13 @@ def read_start(init: Init) -> Start | None:
     if not init:
         return None
     model, folder = load(init.file), init.file.parent
-    trunks = {m: trunk.state_dict() for m, trunk in model.encoders.items()}
-    heads = {m: head.state_dict() for m, head in model.projectors.items()}
     # Only the folder of a run or an artifact knows what its model learned from: a copied file is unknown.
     own = init.file.name.startswith("model.") and (folder / "run.json").exists()
     found = leaks.read_sources(folder, "best" if init.file.name == BEST else "last") if own else None
     learned = [leaks.unknown_source(folder.name if own else init.file.name)] if found is None else found
     # Those that chose the best weights here taught whatever starts from them, its last weights, too.
     learned = [replace(s, name=f"{s.name} of {folder.name}") if s.name.endswith(leaks.CHOSE) else s for s in learned]
-    return Start(init, trunks, heads, model.run.encoder.named(model.encoders), learned, model.spec.sensors)
+    return Start(init, model, learned)
 
 
 def load_trunk(trunk: nn.Module, state: State, file: Path | str = "it") -> None:
@@ -63,20 +58,21 @@ def load_start(start: Start, method: Method) -> dict[str, Any]:
     Returns what was taken, for the record: name, digest, modality -> parts, names of what the weights were trained on,
     and why a modality was not taken. ValueError if nothing fits, or a modality that was asked for does not.
     """
-    init, taken, reasons = start.init, {}, {}
+    init, given, taken, reasons = start.init, start.model, {}, {}
     trunks, heads = method.encoders(), method.projectors()
     for modality in init.modalities or trunks:
-        if modality not in start.trunks:
-            reasons[modality] = f"it has {' and '.join(start.trunks)} only"
+        if modality not in given.encoders:
+            reasons[modality] = f"it has {' and '.join(given.encoders)} only"
             continue
         try:
-            load_trunk(trunks[modality], start.trunks[modality], init.path or "")
+            load_trunk(trunks[modality], given.encoders[modality].state_dict(), init.path or "")
         except ValueError as error:
-            reasons[modality] = f"its trunk is {start.trunk}, {error}"
+            reasons[modality] = f"its trunk is {given.run.encoder.named(given.encoders)}, {error}"
             continue
         taken[modality] = ["trunk"]
-        if init.heads and modality in heads and not misfit(heads[modality].state_dict(), start.heads.get(modality, {})):
-            heads[modality].load_state_dict(start.heads[modality])
+        head = given.projectors[modality].state_dict() if modality in given.projectors else {}
+        if init.heads and modality in heads and not misfit(heads[modality].state_dict(), head):
+            heads[modality].load_state_dict(head)
             taken[modality].append("head")
     if reasons and (init.modalities or not taken):
         why = "; ".join(f"{modality}: {reason}" for modality, reason in reasons.items())

@@ -17,11 +17,9 @@ from tyro.conf import Fixed
 
 from mvitac.registry import check_range
 
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)
 MeanStd = tuple[tuple[float, ...], tuple[float, ...]]
 """Mean and standard deviation of R, G, B, by which levels in [0, 1] are normalised."""
-IMAGENET: MeanStd = (IMAGENET_MEAN, IMAGENET_STD)
+IMAGENET: MeanStd = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 
 LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, as PIL and torchvision use it
 NUM_TRIES = 10  # to draw a crop that fits, then the largest possible one, as in torchvision's RandomResizedCrop
@@ -76,7 +74,6 @@ class Augment:
                 raise ValueError(f"augment size or whole {side}: give a side of 8 to 1024 pixels")
 
     def of(self, modality: str) -> ViewAugment:
-        """The views of ``modality``."""
         return self.vision if modality == "vision" else self.touch
 
     def size_of(self, modality: str) -> int:
