@@ -62,10 +62,9 @@ def paired_difference(
 
     There is one record per seed. Groups are paired. Equal seeds of both methods are, too: they share batches and views.
 
-    Returns:
-        Mean difference, lower and upper end of its 95 % interval, and the two-sided p, at least ``least_p``. p is None if
-        either method was trained with one seed: the variation between seeds is then unknown, and the interval leaves it
-        out. With a single group p is 1.
+    Returns the mean difference, lower and upper end of its 95 % interval, and the two-sided p, at least ``least_p``. p is
+    None if either method was trained with one seed: the variation between seeds is then unknown, and the interval leaves
+    it out. With a single group p is 1.
     """
     ours, theirs = (sorted(r, key=lambda one: -1 if one.get("seed") is None else one["seed"]) for r in (ours, theirs))
     assert len({str(_sizes(r).tolist()) for r in (*ours, *theirs)}) == 1, "scored on different test rows"

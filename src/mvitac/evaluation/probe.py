@@ -44,10 +44,12 @@ class ProbeSplit:
 
     @property
     def fitted(self) -> np.ndarray:
+        """Training and validation rows."""
         return np.concatenate([self.train, self.val])
 
     @property
     def all(self) -> np.ndarray:
+        """Training, validation and test rows, in this order."""
         return np.concatenate([self.train, self.val, self.test])
 
 

@@ -22,17 +22,14 @@ def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_clas
     """
     guess = probabilities.argmax(1)
     present = np.unique(y)
-    num_groups = int(groups.max()) + 1
-    auroc = None
     no_division: dict[str, Any] = {"zero_division": 0}  # a class that is never predicted has precision 0
     _, recall, f1, _ = precision_recall_fscore_support(y, guess, labels=present, average="macro", **no_division)
-    if num_classes == 2 and len(present) == 2:
-        auroc = float(roc_auc_score(y, probabilities[:, 1]))
+    auroc = float(roc_auc_score(y, probabilities[:, 1])) if num_classes == len(present) == 2 else None
     whole = {"accuracy": float((guess == y).mean()), "balanced_accuracy": float(recall), "macro_f1": float(f1)}
     whole |= {"auroc": auroc, "confusion": confusion_matrix(y, guess, labels=range(num_classes)).tolist()}
     class_groups = [len(np.unique(groups[y == k])) for k in range(num_classes)]
-    sizes = np.bincount(groups, minlength=num_groups).tolist()
-    correct = np.bincount(groups, weights=guess == y, minlength=num_groups).astype(int).tolist()
+    sizes = np.bincount(groups).tolist()
+    correct = np.bincount(groups, weights=guess == y).astype(int).tolist()
     by_group = {"num_test": len(y), "group_sizes": sizes, "group_correct": correct}
     return {**whole, "class_groups": class_groups, **by_group}
 

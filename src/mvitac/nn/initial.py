@@ -38,8 +38,7 @@ class Init:
         file = place / MODEL if place.is_dir() else place
         if not file.is_file():
             unfinished = "; its run is not finished, continue it with --resume" * (place / "checkpoint.pt").exists()
-            what = f"init {file} does not exist{unfinished}"
-            raise ValueError(f"{what}: give a finished run or an artifact")
+            raise ValueError(f"init {file} does not exist{unfinished}: give a finished run or an artifact")
         return file
 
     def resolved(self) -> "Init":

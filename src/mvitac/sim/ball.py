@@ -33,9 +33,8 @@ def imprint(pixels: int, x_mm: float, y_mm: float, radius_mm: float) -> F:
 def press_ball(seed: int, number: int, *, size: int, sensors: Sequence[Sensor], background: bool) -> dict[str, Any]:
     """Simulate press ``number`` of the ball at a random place, with a contact of .8 to 1.97 mm radius.
 
-    Returns:
-        "touch" and, if ``background``, "background", the same copy of the sensor before contact (uint8 [size, size, 3]);
-        "sensor", and in mm "contact_x_mm", "contact_y_mm" (right and down from the middle), "radius_mm", "depth_mm".
+    Returns "touch" and, if ``background``, "background", the same copy of the sensor before contact (uint8 [size, size,
+    3]); "sensor", and in mm "contact_x_mm", "contact_y_mm" (right and down from the middle), "radius_mm", "depth_mm".
     """
     rng = np.random.default_rng([_TAG, seed, number])
     sensor = sensors[int(rng.random() * len(sensors))]

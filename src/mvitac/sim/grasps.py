@@ -83,13 +83,14 @@ def grasp(
         touch_rng, view_rng = (np.random.default_rng([tag, *key, order]) for tag in (_TOUCH, _VIEW))
         row: dict[str, Any] = {"phase": moment.phase, **known}
         for side, name, touch in ((0, "left", moment.left), (1, "right", moment.right)):
-            imprint, contacts = _pressed(bench, patch, touch, side, max(GRID, size), measured)
+            imprint, contacts = _pressed(bench, patch, touch, side, max(GRID, size))
             copy: Any = {"unit": units[side], "gain": gain, "pixel_mm": FIELD_MM / len(imprint)}
             x, y = (SHEAR_LIMIT_MM * float(np.tanh(n * SHEAR_MM_PER_N / SHEAR_LIMIT_MM)) for n in touch.shear_n)
             row[f"touch_{name}"] = gel.render(imprint, sensor, touch_rng, shear_mm=(x, y), size=size, **copy)
             row[f"contact_{name}"] = float(imprint.mean())
             row[f"normal_{name}_n"] = touch.normal_n
-            row |= {side_name(known_as, name): value for known_as, value in contacts.items()}
+            if measured:
+                row |= {side_name(known_as, name): value for known_as, value in contacts.items()}
         row["vision"] = camera.photograph(bench, view, view_rng, size=size)
         rows.append(row)
         outcome = {"success": moment.success, "lift_mm": 1000 * moment.rise_m, "unstable": float(moment.unstable)}
@@ -119,11 +120,11 @@ def _latents(thing: objects.Thing, patch: skin.Patch, plan: physics.Plan) -> dic
 
 
 def _pressed(
-    bench: physics.Bench, patch: skin.Patch, touch: physics.Touch, side: int, grid: int, measured: bool
+    bench: physics.Bench, patch: skin.Patch, touch: physics.Touch, side: int, grid: int
 ) -> tuple[np.ndarray, dict[str, float]]:
     """Return the imprint [grid, grid] in mm of the object in one gel, seen from behind the gel; row 0 is up.
 
-    If ``measured``, also return what physics knows of the contact: depth_mm, shear_x_n, ...
+    The dict is what physics knows of the contact: depth_mm, shear_x_n, ...
     """
     pixel, pressed = FIELD_MM / grid, np.zeros((grid, grid), np.float32)
     if touch.normal_n > 0 and (relief := _relief(bench, patch, side, grid)) is not None:
@@ -131,8 +132,6 @@ def _pressed(
         pressed = gel.pressure(relief, force_n=touch.normal_n, **spring)
     # Thickness of the gel; only corners at the rim come near it.
     imprint = np.minimum(gel.imprint(pressed, pixel_mm=pixel), np.float32(2.5))
-    if not measured:
-        return imprint, {}
     shear = dict(zip(("shear_x_n", "shear_y_n"), touch.shear_n, strict=True))
     return imprint, {**gel.contact(pressed, pixel_mm=pixel), **shear}
 

@@ -159,7 +159,6 @@ def _scores(cell: Tensor) -> Tensor:
 
 
 def _error(cells: Cells) -> float:
-    """``mean_error`` over tasks and modalities."""
     return diagnostics.mean_error(_scores(cell).tolist() for cell in cells.values())
 
 
