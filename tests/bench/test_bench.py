@@ -593,6 +593,7 @@ def test_shipped_suites_keep_their_definitions() -> None:
     [
         ("name = ", "is not a suite"),
         (SUITE.replace(FORM, f'{FORM}\npins = {{ rows = "0" }}', 1), "form 'pack' has pins, .* leave them out"),
+        (SUITE.replace("title = ", r'title = "\u0007" #', 1), "is not a suite .control character"),
         (SUITE.replace('"folded"', '"stripes"'), "of stripes, stripes, elsewhere one is there twice"),
         (
             SUITE.replace("labels = [0.3]", "labels = [0.3, 0.3]"),

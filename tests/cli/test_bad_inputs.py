@@ -407,9 +407,7 @@ def test_an_output_that_is_an_input(refused: Callable[..., str], finished: Path,
     times, log = frame.with_name("press_timestamps.csv"), frame.with_name("press_force.csv")
     for name in (times, log):
         name.touch()
-        refused(
-            f"predict e press.mp4 --log {{}}_force.csv:stamp --out {name}", "may be what the command reads"
-        )
+        refused(f"predict e press.mp4 --log {{}}_force.csv:stamp --out {name}", "may be what the command reads")
     refused("probe {run} --json {pack}/pack.json", "may be what the command reads")  # it was trained on
     refused("find x.png --model {run} --known k --json o.png --sheet ./o.png", "is the place of another output")
     (loop := tmp_path / "loop").symlink_to(loop)

@@ -1,9 +1,12 @@
 """Search is exact and finds pairs in both directions."""
 
 import json
+import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
@@ -40,11 +43,11 @@ def test_equals_scikit_learn() -> None:
     np.testing.assert_allclose(cosines, 1 - distances, atol=1e-6)
 
 
-def test_equal_rows_come_in_row_order_and_missing_ones_last() -> None:
+def test_equal_rows_come_in_row_order_and_missing_ones_are_left_out() -> None:
     bank = np.repeat(np.eye(3, dtype=np.float32), 2, axis=0)
     bank[3] = np.nan
     rows, cosines = nearest(bank, np.eye(3, dtype=np.float32)[[2, 1]], 9)  # no more than there are
-    assert rows.tolist() == [[4, 5, 0, 1, 2, 3], [2, 0, 1, 4, 5, 3]] and cosines[0].tolist() == [1, 1, 0, 0, 0, -np.inf]
+    assert rows.tolist() == [[4, 5, 0, 1, 2], [2, 0, 1, 4, 5]] and cosines[0].tolist() == [1, 1, 0, 0, 0]
 
 
 def test_a_row_finds_itself_and_both_directions_work(known: Path, pack: Pack, model: Model) -> None:
@@ -85,6 +88,30 @@ def test_a_changed_file_or_another_models_is_refused(known: Path, tmp_path: Path
             Embeddings(tmp_path / name, model.weights_digest())
     with pytest.raises(ValueError, match="embedded by another model"):
         Embeddings(known, "0" * 64)
+
+
+def test_vectors_that_another_program_changed_are_refused(known: Path, tmp_path: Path, model: Model) -> None:
+    table, file = pq.read_table(known), tmp_path / "other.parquet"
+    whole, at = table.column("vision").to_pylist(), table.column_names.index("vision")
+
+    def opened(vectors: list[Any]) -> Embeddings:
+        sizes = {len(vector or whole[0]) for vector in vectors or whole}
+        column = pa.array(vectors, pa.list_(pa.float32(), sizes.pop() if len(sizes) == 1 else -1))
+        pq.write_table(table.slice(0, len(vectors)).set_column(at, "vision", column), file)
+        return Embeddings(file, model.weights_digest())
+
+    infinite = [[math.inf] * len(whole[0])]
+    for vectors in ([None, *whole[1:]], [whole[0][1:], *whole[1:]], [*infinite, *whole[1:]], []):
+        with pytest.raises(ValueError, match=r"other\.parquet is damaged: .*(one vector|infinite|list_size)"):
+            opened(vectors)
+    query = np.zeros((1, 32, 32, 3), np.uint8)
+    assert opened(whole).find(model, query, "touch", "vision", 3)[1].shape == (1, 3)
+    for vectors in ([[math.nan] * len(whole[0])] * 9, [vector[1:] for vector in whole]):
+        with pytest.raises(ValueError, match=r"other\.parquet has no vision vectors of \d+ numbers"):
+            opened(vectors).find(model, query, "touch", "vision", 3)
+    pq.write_table(table.replace_schema_metadata({"mvitac-embeddings": ""}), file)
+    with pytest.raises(ValueError, match=r"other\.parquet is no table of mvitac embed"):
+        Embeddings(file, model.weights_digest())
 
 
 def test_by_features_only_like_finds_like(artifact: Path, pack: Pack, tmp_path: Path, model: Model) -> None:

@@ -87,6 +87,10 @@ def test_table1_has_one_budget_and_ablation_leaves_out_what_changes_nothing(pack
         lay_out(small(pack), with_columns(pack, split=["train"] * pack.num), tmp_path, ProbeConfig())
     with pytest.raises(ValueError, match="batch_size is 999: give --set batch_size=72 or less"):
         lay_out(small(pack, rows=ABLATION.rows, set={"batch_size": 999}), pack, tmp_path, ProbeConfig())
+    own = lay_out(
+        small(pack, rows=(Row(label="MViTac"), Row(label="b", set={"batch_size": 999}))), pack, tmp_path, ProbeConfig()
+    )
+    assert own.left_out["b"].endswith("batch_size is 999: give batch_size=72 or less")
 
 
 def test_rows_the_data_does_not_allow_are_told(tmp_path: Path) -> None:

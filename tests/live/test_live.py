@@ -145,6 +145,10 @@ def test_a_background_is_forgotten_between_frames(engine: Engine) -> None:
     assert contact.background is not None
     world.live.tick()
     assert contact.background is None and world.live.contact is None
+    kept: list[Any] = []
+    world.live.record = lambda images, columns: kept.append(columns)
+    world.run(0.5)
+    assert world.live.contact is None and not kept  # whether it is touched is not known, so that it is no rest
 
 
 def test_minutes_of_faults(engine: Engine) -> None:

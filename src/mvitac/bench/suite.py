@@ -5,7 +5,6 @@ digests of the data that was measured. A definition that changes gets another na
 """
 
 import re
-import tomllib
 import typing
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -23,7 +22,7 @@ from mvitac.datasets.table.splits import folds
 from mvitac.evaluation.probe import VALUE_PROBES
 from mvitac.evaluation.probe_config import Probe
 from mvitac.registry import check_known, from_json, to_json, unknown
-from mvitac.system.files import brief, digest
+from mvitac.system.files import brief, digest, parse_toml
 
 SUITES = Path(__file__).parent / "suites"
 VERSION = re.compile(r"-v\d+$")  # at the end of a suite's name
@@ -127,7 +126,7 @@ def find_suite(name: str) -> Suite:
     if not file.is_file():
         raise unknown("suite", name, [*shipped(), "FILE.toml"])
     try:
-        suite = from_json(Suite, tomllib.loads(file.read_text()), "suite")
+        suite = from_json(Suite, parse_toml(file.read_text()), "suite")
         for form in (form for one in suite.sets for form in one.forms):
             _check_places(form, _config(form, Path(), form.data))
             if form.pins and suite.name not in shipped():
@@ -137,7 +136,7 @@ def find_suite(name: str) -> Suite:
                 raise ValueError(f"control {text!r}: give external:timm/NAME,weights={weights}, which reads both")
         if file == Path(name) and (now := outdated(suite)):
             raise ValueError(f"{now} of this version is another suite: give it another name than {suite.name}")
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError) as error:
+    except ValueError as error:
         raise ValueError(f"{file} is not a suite ({brief(error)})") from None
     return suite
 

@@ -108,7 +108,7 @@ def live(argv: list[str]) -> None:
     if options.record:  # last, for a refusal must leave no spool
         loop.record = recorder = Recorder(options.record, sensor=sensor, tell=_say)
     _run(loop, options.seconds)
-    if any(contact.background is None for contact in loop.contacts.values()):
+    if loop.counts["calibrated"] < sum(contact.free is None for contact in loop.contacts.values()):
         _say(f"contact was never known: no {options.live.calibration} frames without it, and no --background")
     _say(f"summary: {json.dumps(loop.summary())}")
     try:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from tyro.conf import Fixed
 
 from mvitac.data.images import ros_pixels
 from mvitac.datasets.table.clocks import check_moves, joined, nearest
@@ -40,6 +41,8 @@ class RosbagConfig(RecordedConfig):
     touch: tuple[str, ...] = ()
     """Topic of tactile images, or two to stack. Its images (or else those of vision) are the rows."""
     every: int | None = 5
+    allow_missing: Fixed[bool] = False
+    """A row has every image."""
     group: str | None = "recording"
 
     @classmethod

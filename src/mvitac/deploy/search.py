@@ -53,15 +53,18 @@ class Embeddings:
         self.file = file
         try:
             self.table: pa.Table = pq.read_table(file, page_checksum_verification=True)
-        except (pa.ArrowException, OSError) as error:
+            about = json.loads((self.table.schema.metadata or {})[ABOUT])
+        except (pa.ArrowException, OSError, KeyError, ValueError) as error:
             raise ValueError(f"{file} is no table of mvitac embed: {brief(error)}") from None
         with fields_of(file):
-            about = json.loads(self.table.schema.metadata[ABOUT])
             self.shared, self.pack, self.pack_digest = about["shared"], Path(about["pack"]), about["pack_digest"]
             self.classes = from_json(dict[str, tuple[str, ...]], about["classes"], "classes")
             self.table.select(["id", "group", "row"])  # KeyError if one is missing
             columns = {m: self.table.column(m) for m in ("vision", "touch") if m in self.table.column_names}
+            whole = all(column.type.list_size and not column.null_count for column in columns.values())
+            assert whole and self.table.num_rows, "not one vector in every row"
             given = {m: column.combine_chunks().flatten().to_numpy() for m, column in columns.items()}
+            assert not any(np.isinf(x).any() for x in given.values()), "infinite numbers"
             self.banks = {m: unit(x.reshape(self.table.num_rows, -1)) for m, x in given.items()}
             if about["weights"] != weights:
                 raise ValueError(f"{file} was embedded by another model: embed the pack again")
@@ -87,7 +90,12 @@ class Embeddings:
         if source != target and not self.shared:
             raise ValueError(f"{self.file} holds features, where {source} finds no {target}: embed with --shared")
         x = model.embed(**{source: images}, background=background, shared=self.shared)[source]
-        return nearest(self.banks[target], unit(x.cpu().numpy()), k)
+        bank = self.banks[target]
+        if not np.isfinite(bank).any() or bank.shape[1] != x.shape[1]:
+            raise ValueError(
+                f"{self.file} has no {target} vectors of {x.shape[1]} numbers: embed data that has {target}"
+            )
+        return nearest(bank, unit(x.cpu().numpy()), k)
 
     def labels(self, row: int) -> dict[str, str]:
         """Class names of one row by task, where it has a label."""
@@ -103,10 +111,11 @@ def unit(x: np.ndarray) -> np.ndarray:
 def nearest(bank: np.ndarray, queries: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Row numbers and cosines [Q, k] of the ``k`` nearest rows (or all), best first.
 
-    Exact: one matrix product. ``bank`` [N, D] and ``queries`` [Q, D] are float32 of unit length; rows of NaN come last.
+    Exact: one matrix product. ``bank`` [N, D] and ``queries`` [Q, D] are float32 of unit length; rows of NaN are left out.
     """
+    k = min(k, int(np.isfinite(bank).all(1).sum()))
     found = np.nan_to_num(queries @ bank.T, nan=-np.inf)
-    best = np.sort(np.argpartition(-found, min(k, len(bank)) - 1, axis=1)[:, :k], axis=1)
+    best = np.sort(np.argpartition(-found, k - 1, axis=1)[:, :k], axis=1)
     scores = np.take_along_axis(found, best, axis=1)
     order = np.argsort(-scores, axis=1, kind="stable")  # equal ones in row order
     return np.take_along_axis(best, order, axis=1), np.take_along_axis(scores, order, axis=1)

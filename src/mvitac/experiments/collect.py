@@ -56,7 +56,8 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str
         except ValueError as error:
             # It names options of pretrain; those of data are compare's, too.
             found = re.split(r"--(?!data)(\S+) (?=\d)", str(error))
-            found[1::2] = [f"--set {option.replace('-', '_')}=" for option in found[1::2]]
+            fields = [option.replace("-", "_") for option in found[1::2]]
+            found[1::2] = [f"{name}=" if name in row.set else f"--set {name}=" for name in fields]  # a row's own count
             left_out[row.label] = "".join(found)
             continue
         if key in seen:

@@ -1,6 +1,5 @@
 """The description of a comparison: rows, tasks, probes, seeds. Plans that ship with the package are in ``plans/``."""
 
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from mvitac.methods.base import MethodConfig
 from mvitac.recipes import recipe, with_method
 from mvitac.registry import check_known, check_range, default, from_json, to_json, unknown
 from mvitac.run import Run
-from mvitac.system.files import brief, parse_json
+from mvitac.system.files import brief, parse_json, parse_toml
 
 PLANS = ("table1", "table2", "ablation", "recipes")
 Printed = dict[str, dict[str, float]]  # modality -> task -> top-1 accuracy in percent as printed in the paper
@@ -127,7 +126,7 @@ def find_plan(given: str) -> Plan:
         raise unknown("plan", given, [*PLANS, "a .toml file", "a .json file"])
     try:
         text = path.read_text()
-        value = tomllib.loads(text) if path.suffix == ".toml" else parse_json(text)
+        value = parse_toml(text) if path.suffix == ".toml" else parse_json(text)
     except FileNotFoundError:
         raise ValueError(f"plan {given} does not exist: choose {', '.join(PLANS)}, or give a file that does") from None
     except (ValueError, RecursionError) as error:

@@ -146,7 +146,8 @@ class Live:
             self.ages.append(self.clock() - min(f.time for f in frames[self._leads] if f))
             self.max_age = max(self.max_age, self.ages[-1])
             self.num_predictions += 1
-        if self.record:
+        # Before the first calibration it shows no contact (docs/live.md); after it, what is not known is no rest.
+        if self.record and (self.contact is not None or not self.counts["calibrated"]):
             self.record(images, {"time": now, "contact": bool(self.contact), "touch_number": self.num_touches})
         return given is not None
 

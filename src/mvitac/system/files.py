@@ -145,6 +145,13 @@ def parse_json(text: str) -> Any:
         raise ValueError("too many brackets inside each other") from None
 
 
+def parse_toml(text: str) -> Any:
+    """Parse TOML, as ``parse_json``."""
+    import tomllib  # of Python 3.11: a robot may have 3.10, and needs no TOML
+
+    return parse_json(json.dumps(tomllib.loads(text), default=str))
+
+
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(found := dict(pairs)) < len(pairs):
         raise ValueError(f"two entries of one name: {', '.join(name for name, _ in pairs)}")
