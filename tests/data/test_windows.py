@@ -23,6 +23,7 @@ from mvitac.recipes import recipe
 from mvitac.training.loop import train
 from mvitac.training.sampler import draw_positives
 from mvitac.transforms.random_views import Augment
+from support.toy import with_columns
 from support.training_runs import train_twice
 
 TOUCHES, LENGTH = 8, 6
@@ -109,9 +110,12 @@ def test_other_windows_are_other_data_and_single_frames_are_the_pack_itself(pres
         ({"frames": 3, "stride": 0.5}, "give more, or another"),
         ({"frames": 2, "order": "split"}, "not a number in row 0"),
         ({"frames": 2, "order": "label_late"}, "two rows of touch"),
+        ({"order": "frame", "minus_first": True}, "every touch has one row, its own first"),
     ],
 )
 def test_windows_that_cannot_be_made(presses: Pack, options: dict[str, Any], message: str) -> None:
+    if "minus_first" in options:
+        presses = with_columns(presses, touch_group=[*map(str, range(presses.num))])
     with pytest.raises(ValueError, match=message):
         windowed(presses, Window(**options))
 
@@ -173,4 +177,7 @@ def test_frames_without_an_order_are_refused_and_positives_near_in_time_that_can
     unordered = replace(run, data=PackConfig(path=pack.path), positives="same-touch", positives_within=2.0)
     with pytest.raises(ValueError, match="has no frame, seq, time to order frames"):
         train(unordered, tmp_path / "run", quiet=True)
+    two = with_columns(presses, frame=[0] * presses.num)  # two recordings in one touch
+    with pytest.raises(ValueError, match=r"two rows of touch .* are at 0: pack with --touch-group"):
+        train(unordered, tmp_path / "run", quiet=True, pack=two)
     assert not (tmp_path / "run" / "run.json").exists()

@@ -21,7 +21,9 @@ from mvitac.data.pack import Pack
 from mvitac.data.row_hashes import image_sums, known_images
 from mvitac.data.several import JoinedPack
 from mvitac.data.source import Sample
-from mvitac.data.spec import DataSpec
+from mvitac.data.spec import DataSpec, Window
+from mvitac.data.windows import windowed
+from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.pack import ON_VAL, PackConfig
 from mvitac.deploy.publish import publish
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs, stored_result
@@ -214,6 +216,25 @@ def test_the_same_images_under_other_names_leak(pack: Pack, tmp_path: Path, kept
         assert leak.startswith(f"{num} of {len(rows)} test rows and 0 of") if num else leak == ""
 
 
+def test_the_image_of_one_of_two_gels_is_a_leak(tmp_path: Path) -> None:
+    """Alone in either place, also in windows, which begin with the newest frame."""
+    rng = np.random.default_rng(0)
+    left, right, other = (rng.integers(0, 255, (4, 32, 32, 3), dtype=np.uint8) for _ in range(3))
+    packs = {}
+    for name, (one, two) in {"a": (left, right), "b": (other, left), "c": (other, other)}.items():
+        for i, image in enumerate(np.concatenate([one, two], axis=3)):
+            for side in range(2):
+                Image.fromarray(image[..., 3 * side : 3 * side + 3]).save(tmp_path / f"{name}{side}{i}.png")
+        lines = (f"{name}0{i}.png,{name}1{i}.png,{name}{i // 2},{i % 2}" for i in range(4))
+        (tmp_path / f"{name}.csv").write_text("\n".join(["left,right,press,frame", *lines]))
+        config = FolderConfig(path=tmp_path / f"{name}.csv", title=name, touch=("left", "right"), group="press")
+        packs[name] = build(config.source(), tmp_path / name, size=32, quiet=True)
+    seen = [source_of(packs["a"], np.arange(4))]
+    for pack in (packs["b"], windowed(packs["b"], Window(frames=2))):
+        assert Scored(pack).leak(seen, np.arange(4)).startswith("4 of 4 test rows and 0 of")
+    assert Scored(packs["c"]).leak(seen, np.arange(4)) == ""
+
+
 def test_equal_checksums_by_chance_are_no_leak(pack: Pack) -> None:
     """Of 100,000 and 100,000 different images, two or three have the same CRC-32."""
     rows, sums = pack.rows("train"), image_sums(pack)
@@ -241,6 +262,8 @@ def test_data_that_changed_since_training_is_said(
         and main([*again, str(tmp_path / "b")]) == 0
     )
     assert "its data is not that of" in capsys.readouterr().err
+    assert main(["export", str(run), "--out", str(tmp_path / "x")]) == 0
+    assert "changed since training: its answers are of the new" in capsys.readouterr().err
 
 
 def test_scores_on_val_are_not_taken_for_those_on_test(pack: Pack, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """``mvitac publish`` and ``export``: a trained model for other people and other engines."""
 
 import shlex
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,6 +44,14 @@ def publish(argv: list[str]) -> None:
     print(f"written: {out}\nto the Hub: hf upload OWNER/NAME {shlex.quote(str(out))}")
 
 
+def warn_changed(run: str, pack: Pack) -> None:
+    """Say it on stderr if ``pack``, on which probes are fitted, is not the data that ``run`` was trained on."""
+    from mvitac.evaluation.evaluate import trained_on
+
+    if trained_on(Path(run)) not in (None, pack.digest):
+        print(f"mvitac: warning: the data of {run} changed since training: its answers are of the new", file=sys.stderr)
+
+
 @dataclass(frozen=True, kw_only=True)
 class _ExportOptions(ExportConfig):
     """Write a model as ONNX, for OpenVINO and ONNX Runtime: uint8 in, embeddings, probabilities and values out. The result
@@ -75,6 +84,8 @@ def export(argv: list[str]) -> None:
     model = load(options.model)
     how = "check the export on a pack, --on PACK"
     pack = Pack(options.on) if options.on else own_data(model, how, few=1000 * bool(model.probes))
+    if not (options.on or model.probes):
+        warn_changed(options.model, pack)
     pack = as_trained(model, pack)
     print("writing and checking the export takes up to a minute", flush=True)
     with shown():

@@ -271,6 +271,7 @@ def _engine(model: str, threads: int, modalities: tuple[Any, ...] = (), *, most:
         return engine
     check_models(model)
     loading()
+    from mvitac.cli.deploy import warn_changed
     from mvitac.deploy.artifact import load
     from mvitac.deploy.export import ExportConfig, export
     from mvitac.deploy.publish import own_data, with_probes
@@ -283,7 +284,8 @@ def _engine(model: str, threads: int, modalities: tuple[Any, ...] = (), *, most:
     # Artifacts of one run differ in their probes. A run has none: its data, as it is now, decides those that are fitted.
     probes: list[Any] = [[to_json(r.info), safetensors_digest(dict(r.state_dict()))] for r in loaded.probes.values()]
     how = "`mvitac export MODEL --on PACK --out DIR` first, and give DIR"
-    pack = None if probes else own_data(loaded, how)
+    if (pack := None if probes else own_data(loaded, how)) is not None:
+        warn_changed(model, pack)
     about = [to_json(loaded.spec), probes or (pack and [pack.digest, to_json(pack.spec)])]
     folder = cache_dir() / "exports" / digest([EXPORT.version, loaded.weights_digest(), about, *modalities])[:32]
     if not folder.exists():

@@ -99,11 +99,7 @@ def read_episodes(pack: Pack) -> Episodes:
     least, most = np.fmin.reduce(values["action"]), np.fmax.reduce(values["action"])
     if not (least < most).any():
         raise ValueError(f"{pack.path}: values action never change, so no policy can be told from another")
-    name, place = places(pack, pack.spec.window)
-    rows = list(recordings(pack, place))
-    if twice := [each for each in rows if (np.diff(place[each]) == 0).any()]:
-        two = f"{len(twice)} episodes have two rows with the same {name}, the first at row {twice[0][0]}"
-        raise ValueError(f"{pack.path}: {two}: pack with --touch-group RECORDING, or name another --data.order")
+    rows = list(recordings(pack, places(pack, pack.spec.window)[1]))
     unseen = [each for each in rows if (pack.column("split")[each] == "test").all()]
     of, rows = (" of split test", unseen) if len(unseen) > 1 else ("", rows)
     if len(rows) < 2:

@@ -1,6 +1,7 @@
 """Hashes of ids, groups and images of rows, by which packs find rows of each other."""
 
 import hashlib
+import zlib
 
 import numpy as np
 from scipy.special import gammainc
@@ -8,6 +9,9 @@ from scipy.special import gammainc
 from mvitac.data.pack import Pack
 from mvitac.data.spec import MODALITIES
 
+IMAGES = *((m, slice(None)) for m in MODALITIES), ("touch", slice(3)), ("touch", slice(3, 6))
+"""Modality and channels of what ``image_sums`` compares: the last two are each of two touch sensors."""
+_KNOWN: dict[str, np.ndarray] = {}  # digest of a pack -> ``_each_sensor``
 CHANCE = 1e-4  # how often equal checksums of different images may be taken for a leak
 
 
@@ -25,31 +29,46 @@ def row_hashes(pack: Pack) -> tuple[np.ndarray, np.ndarray]:
 
 
 def image_sums(pack: Pack) -> np.ndarray:
-    """uint64 [N, 2]: modality and checksum (CRC-32) of each image as one number; 0 where a row has none.
+    """uint64 [N, 4]: modality and checksum (CRC-32) of each image as one number; 0 where a row has none.
 
-    Columns are those of ``MODALITIES``. Images with the same pixels, stored alike at one size, have the same number.
+    Columns are those of ``IMAGES``: a row of two touch sensors has one for both, and one of each. Images with the same
+    pixels, stored alike at one size, have the same number.
     """
     if pack.parts:
         return np.concatenate([*map(image_sums, pack.parts.values())])
-    found = np.zeros((pack.num, len(MODALITIES)), np.uint64)
+    found = np.zeros((pack.num, len(IMAGES)), np.uint64)
     for place, modality in enumerate(MODALITIES):
         if f"crc_{modality}" in pack.table.column_names:
             sums = pack.column(f"crc_{modality}").astype(np.uint64) + np.uint64(place + 1 << 32)
             found[:, place] = np.where(pack.has(modality), sums, 0)
+    if pack.spec.touch_channels > 3:
+        sums = _each_sensor(pack) + np.uint64(len(MODALITIES) + 1 << 32)
+        found[:, len(MODALITIES) :] = np.where(pack.has("touch")[:, None], sums, 0)
     return found
 
 
+def _each_sensor(pack: Pack) -> np.ndarray:
+    """Checksums uint64 [N, 2] of the images of two touch sensors, which the table has for both together only."""
+    if pack.digest not in _KNOWN:
+        images = getattr(pack.images["touch"], "frames", pack.images["touch"])  # of windows, single frames
+        several = (images[i : i + 64] for i in range(0, pack.num, 64))
+        pairs = [np.split(image, 2, axis=2) for some in several for image in np.asarray(some)]
+        _KNOWN[pack.digest] = np.array([[zlib.crc32(one.tobytes()) for one in pair] for pair in pairs], np.uint64)
+    return _KNOWN[pack.digest]
+
+
 def known_images(pack: Pack, rows: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """bool [rows, 2]: which images of ``rows`` are among ``known``, sums of ``image_sums``.
+    """bool [rows, 4]: which images of ``rows`` are among ``known``, sums of ``image_sums``.
 
     An image of a single value (nothing) does not count, nor do so few equal checksums that chance may explain them.
     """
     own, known = image_sums(pack)[rows], np.unique(known)
     same = (own > 0) & np.isin(own, known)
-    for place, modality in enumerate(MODALITIES):
+    for place, (modality, channels) in enumerate(IMAGES):
         for i in np.flatnonzero(same[:, place]):
-            same[i, place] = np.ptp(pack.images[modality][rows[i]]) > 0
-        expected = len(rows) * np.count_nonzero(known >> np.uint64(32) == place + 1) / 2**32
+            same[i, place] = np.ptp(pack.images[modality][rows[i]][..., channels]) > 0
+        kind = min(place, len(MODALITIES)) + 1
+        expected = len(rows) * np.count_nonzero(known >> np.uint64(32) == kind) / 2**32
         if (num := same[:, place].sum()) and gammainc(num, expected) > CHANCE:  # of a Poisson number: num or more
             same[:, place] = False
     return same

@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from mvitac.data.lazy import Pieces
 from mvitac.data.pack import Pack
-from mvitac.data.row_hashes import image_sums, known_images, row_hashes
+from mvitac.data.row_hashes import IMAGES, image_sums, known_images, row_hashes
 from mvitac.data.spec import MODALITIES, AnyTask, DataSpec, Task, ValueTask
 from mvitac.registry import unknown
 from mvitac.system.files import digest
@@ -346,7 +346,7 @@ def _text(cells: Iterable[str]) -> pa.Array:
 
 def _known_image(pack: Pack, rows: np.ndarray, sums: np.ndarray) -> tuple[str, int] | None:
     """The first image of ``rows`` that is among ``sums``, and how many there are of its modality."""
-    for same, modality in zip(known_images(pack, rows, sums).T, MODALITIES, strict=True):
+    for same, (modality, _) in zip(known_images(pack, rows, sums).T, IMAGES, strict=True):
         if same.any():
             return f"the {modality} image of row {str(pack.own_ids[rows[same][0]])!r}", int(same.sum())
     return None

@@ -69,10 +69,14 @@ class Windows(Lazy):
 
 
 def recordings(pack: Pack, place: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the rows of each touch in the order of ``place`` [N]."""
+    """Yield the rows of each touch in the order of ``place`` [N]; ValueError if two have the same."""
     for group in range(int(pack.touch_groups.max()) + 1):
         rows = pack.rows_of(group)
-        yield rows[np.argsort(place[rows], kind="stable")]
+        rows = rows[np.argsort(place[rows], kind="stable")]
+        if (same := np.diff(place[rows]) == 0).any():
+            two = f"two rows of touch {_touch(pack, rows)!r} are at {place[rows[int(np.flatnonzero(same)[0])]]:g}"
+            raise ValueError(f"{two}: pack with --touch-group RECORDING, or name another --data.order")
+        yield rows
 
 
 def frames_of(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -84,9 +88,6 @@ def frames_of(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray, np.nd
     first = np.zeros(pack.num, np.int64)
     for rows in recordings(pack, place):
         times = place[rows]
-        if (same := np.diff(times) == 0).any():
-            two = f"two rows of touch {_touch(pack, rows)!r} have {name} {times[int(np.flatnonzero(same)[0])]:g}"
-            raise ValueError(f"{two}: pack with --touch-group RECORDING, or name another --data.order")
         if window.frames > 1 and len(times) > 2 and (step := np.median(np.diff(times))) > 1.25 * window.stride:
             far = f"the distance of frames in touch {_touch(pack, rows)!r}, {step:g} (column {name})"
             raise ValueError(f"stride {window.stride:g} is shorter than {far}: give more, or another --data.order")
@@ -94,6 +95,8 @@ def frames_of(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray, np.nd
         index[rows] = rows[np.maximum(np.searchsorted(times, asked + 1e-9, side="right") - 1, 0)]
         whole[rows] = asked[:, -1] >= times[0] - 1e-9
         first[rows] = rows[0]
+    if window.minus_first and (first == np.arange(pack.num)).all():
+        raise ValueError(f"{pack.path}: every touch has one row, its own first: pack with --touch-group RECORDING")
     if not whole.any():
         raise ValueError(f"{pack.path}: frames {window.frames} at stride {window.stride:g} are longer than every touch")
     return index, whole, first

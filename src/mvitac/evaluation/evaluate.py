@@ -203,7 +203,7 @@ def _common_pack(paths: Sequence[Path], models: Sequence[Model], pack: Pack | No
 
 def noted(pack: Pack, paths: Sequence[Path]) -> Pack:
     """The data that the runs at ``paths`` name; with a note if it is not what they were trained on."""
-    if {_trained_on(path) for path in paths} - {None, pack.digest}:
+    if {trained_on(path) for path in paths} - {None, pack.digest}:
         pack = copy(pack)
         pack.spec = replace(pack.spec, notes=(*pack.spec.notes, "the data of these runs changed since training"))
     return pack
@@ -221,7 +221,7 @@ def _unlearned(views: Iterable[tuple[AnyTask, Iterable[Pack]]]) -> list[str]:
     return lines
 
 
-def _trained_on(path: Path) -> str | None:
+def trained_on(path: Path) -> str | None:
     """The digest of the pack that the run at ``path`` was trained on, if it is known."""
     return load_run(path)[1].get("pack") if (path / "run.json").exists() else None
 
@@ -292,7 +292,7 @@ def check_unseen(
     for path in paths:
         sources.append(learned := read_sources(path, weights))
         own = 1 + any(source.name.endswith(CHOSE) for source in (learned or [])[1:2])  # the run's own rows
-        refused = [] if allow_leak else (learned or [])[own if _trained_on(path) == pack.digest else 0 :]
+        refused = [] if allow_leak else (learned or [])[own if trained_on(path) == pack.digest else 0 :]
         for task in tasks if refused else ():
             if (leak := scored.leak(refused, split_rows(pack, task).test)) not in ("", UNKNOWN):
                 seen = f"{path} has seen what {pack.path} would score, task {task.name!r}: {leak}"

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
-from mvitac.data.windows import places
+from mvitac.data.windows import places, recordings
 from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation import leaks
 from mvitac.evaluation.features import features
@@ -62,7 +62,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     asked, device = check_start(asked, out)
     pack = open_pack(asked.data, world, quiet) if pack is None else pack
     if asked.positives_within:
-        places(pack, pack.spec.window)
+        list(recordings(pack, places(pack, pack.spec.window)[1]))  # ValueError if the distance of two rows is not known
     rows = asked.method.training_rows(pack)
     asked.check(pack.spec, len(rows), pack.size)
     check_divisible(asked, world)

@@ -52,7 +52,7 @@ class RowsConfig(DatasetConfig, ABC):
     "left" and "right"; "" = none."""
     labels: tuple[str, ...] = ()
     """Columns that become tasks. Classes are the sorted distinct values; an empty cell or NaN is unlabelled. Unicode
-    forms and blanks are made equal."""
+    forms and blanks are made equal, and whole numbers: 1.0 is 1."""
     values: tuple[str, ...] = ()
     """Columns of numbers to predict, as column:unit, e.g. force_n:N; or several as one task: pose=z_mm:mm,tilt_deg:deg.
     state[2] is the third number of a column of lists. An empty cell or NaN is not measured."""
@@ -314,10 +314,10 @@ class Rows(Source):
         if not config.allow_leak:
             for what, names in whole.items():
                 splits.check_leak(where, column, what, names, found)
-            for name in self._images:
-                there = [(ref, side) for ref, side in zip(table.images[name], found, strict=True) if ref]
+            for names in filter(None, (self._images[: bool(self._vision)], self._touch)):  # left here, right there
+                there = [(ref, at) for name in names for ref, at in zip(table.images[name], found, strict=True) if ref]
                 images = [os.path.normpath(str(ref)) for ref, _ in there]
-                splits.check_leak(where, column, f"{name} images", images, [side for _, side in there])
+                splits.check_leak(where, column, f"{' and '.join(names)} images", images, [side for _, side in there])
         splits.check_sides(where, column, found, tasks, labels, len(set(groups)))
         return found
 
