@@ -338,6 +338,18 @@ def no_touch(value: dict[str, Any]) -> None:
 RECORDS, VALUES = ("blocks", 0, "records"), ("blocks", 1, "records", 0)
 MORE_CORRECT = put(*RECORDS, 0, "sums", "correct", 0, value=1000)
 FEW, NO_VISION, NO_TOUCH = "30 % of labels", "the encoder has no vision", "the encoder has no touch"
+
+
+def twins(value: dict[str, Any]) -> None:
+    """The better untrained trunk twice."""
+    for records in (block.get("records", ()) for block in value["blocks"]):
+        known = {
+            (r["modality"], r["probe"]): r["sums"] for r in records if (r["source"], r["seed"]) == ("untrained", 0)
+        }
+        for record in (r for r in records if r["source"] == "untrained"):
+            record["sums"] = known[record["modality"], record["probe"]]
+
+
 FORGED: dict[str, tuple[Change, str]] = {
     "correct": (MORE_CORRECT, "more correct rows than rows"),
     "negative squares": (put(*VALUES, "sums", "squared_error", 0, 0, value=-1.0), "squared errors are smaller"),
@@ -379,7 +391,7 @@ FORGED: dict[str, tuple[Change, str]] = {
     "simulated": (simulated, "elsewhere, pattern: vision cannot be left out because .*elsewhere is not there"),
     "leak": (put("blocks", 0, "leaks", value=[-1]), "a leak mark, a note, a group or what"),
     "group by": (lambda value: value["blocks"][0].pop("group_by"), "a leak mark, a note, a group or what"),
-    "list for a number": (put("encoder", "images_seen", value=[]), "a.json is damaged"),
+    "list for a number": (put("encoder", "images_seen", value=[]), r"images_seen is \[\]"),
     "nothing": (lambda value: [not_run(block) for block in value["blocks"]], "was run on no task"),
     "twice": (put(*RECORDS, value=lambda records: [*records, records[0]]), "is there twice"),
     "modality": (lambda value: drop(value, source="", modality="both"), f"lacks the encoder, both, {FEW}, 0"),
@@ -391,8 +403,10 @@ FORGED: dict[str, tuple[Change, str]] = {
     "no name": (put("encoder", "name", value=" "), "has the name ' '"),
     "images": (put("encoder", "images_seen", value=-5), "images_seen is -5"),
     "parameters": (put("encoder", "parameters", "touch", value=float("nan")), "touch is nan"),
-    "a text for a number": (put("encoder", "size", value="32"), "a.json is damaged"),
+    "a text for a number": (put("encoder", "size", value="32"), "size is 32"),
     "form": (put("blocks", 0, "form", value="mine"), "the suite has no form 'mine'"),
+    "twins": (twins, "untrained has the same sums in every record of seeds 0 and 1"),
+    "true for a number": (put("encoder", "images_seen", value=True), "images_seen is True"),
     "encoder without seeds": (lambda value: value["encoder"].pop("seeds"), "a.json is damaged"),
     "block without data": (lambda value: value["blocks"][0].pop("data"), "a.json is damaged"),
 }
@@ -415,12 +429,21 @@ def more_spread(value: dict[str, Any]) -> None:
                 record["sums"][sums] = [[by * x for x in each] for each in record["sums"][sums]]
 
 
+def blind_pixels(value: dict[str, Any]) -> None:
+    for record in (r for r in value["blocks"][0]["records"] if r["source"] == "pixels"):
+        record["sums"]["correct"] = [0] * len(record["sums"]["n"])
+
+
 def test_what_a_result_says_of_rows_and_of_leaks_is_compared(
     results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     forged = changed(results[1], tmp_path / "a.json", more_spread, signed=True)
     assert main(["bench", "check", str(forged)]) == 0
     assert "the control mean differs between" in said(capsys, "bench", "board", results[0], forged)
+    forged = changed(results[1], tmp_path / "a.json", blind_pixels, signed=True)
+    assert main(["bench", "check", str(forged)]) == 0
+    page = write_board([results[0], forged], tmp_path / "x.html").read_text()
+    assert "pattern: pixels of the result of " in page and "differ from those shown" in page
     seen = put("encoder", "trained_on", value="ImageNet; toy stripes")
     forged = changed(results[1], tmp_path / "a.json", seen, signed=True)
     assert "its marks of leaks are not those of data trained on, Image" in said(capsys, "bench", "check", forged)

@@ -193,6 +193,21 @@ def test_in_a_closed_loop_success_is_the_measure() -> None:
     assert blind["verdicts"]["touch"].startswith("The policy does not use touch") and blind["error"][0] > 0.8
 
 
+def test_a_film_without_touch_comes_after_the_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite = replace(find_suite("insert-v1"), episodes=3, demonstrations=(4,))
+    monkeypatch.setattr("mvitac.cli.ablate.find_suite", lambda name: suite)
+    (policy := tmp_path / "still.py").write_text("act = lambda given: [0.0, 0.0]")
+    command = ["ablate", f"{policy}:act", "--data", "insert-v1/vision/4", "--out"]
+    assert main([*command, str(tmp_path / "film.png")]) == 2 and "name of a .webp" in capsys.readouterr().err
+    film = tmp_path / "new" / "film.webp"
+    assert main([*command, str(film)]) == 0
+    assert capsys.readouterr().out.endswith(f"written: {film}\n")
+    with Image.open(film) as made:
+        assert made.n_frames == 18
+
+
 def test_film_and_learned_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     suite = replace(find_suite("insert-v1"), episodes=3, demonstrations=(4,))
     episodes = suite_episodes(suite, ("touch", "4"))

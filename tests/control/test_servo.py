@@ -153,6 +153,12 @@ def _twin(value: dict[str, Any]) -> None:
     second["cells"] = first["cells"]
 
 
+def _copied(value: dict[str, Any]) -> None:
+    """What it does in one condition is said of the next, too."""
+    first, second = value["rows"][0]["cells"][:2]
+    second |= {key: first[key] for key in ("mm", "deg", "lost")}
+
+
 def _not_lost(value: dict[str, Any]) -> None:
     cell = next(row for row in value["rows"] if row["source"] == "no touch")["cells"][0]
     limit, n = task_of(cell["task"]).limit, cell["n"][0]
@@ -173,8 +179,10 @@ CHANGES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "the name of a control": lambda value: value["encoder"].update(name="true pose"),
     "has the unknown field 'film'": put("film", value=1),
     "has the unknown field 'score'": put("rows", 0, "cells", 0, "score", value=1.0),
+    "its sums are not of": lambda value: value["rows"][0]["cells"][0]["mm"].pop(),
+    "the encoder, seed 5, .* has the sums of the encoder, seed 5": _copied,
     "a sum is no number": put("rows", 0, "cells", 0, "mm", 0, value="1.0"),
-    "untrained has two seeds with the same sums": _twin,
+    "untrained, seed 1, .* has the sums of untrained, seed 0": _twin,
     "weights for seeds": lambda value: value["encoder"]["weights"].append("0" * 64),
 }
 

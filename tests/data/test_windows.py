@@ -169,7 +169,7 @@ def test_frames_without_an_order_are_refused_and_positives_near_in_time_that_can
     presses: Pack, pack: Pack, tmp_path: Path
 ) -> None:
     for order, says in ((None, "frame, seq, time"), ("frame", "frame"), ("fram", "fram")):
-        with pytest.raises(ValueError, match=f"{pack.path} has no {says} to order frames: train with another"):
+        with pytest.raises(ValueError, match=f"{pack.path} has no {says} to order frames: name another"):
             windowed(pack, Window(frames=2, order=order))
     run = recipe("smoke", PackConfig(path=presses.path))
     with pytest.raises(ValueError, match="no effect on same-image positives"):

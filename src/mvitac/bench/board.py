@@ -117,11 +117,19 @@ def gather(results: dict[str, dict[str, Any]]) -> Board:
                 wrong = min(k for sums in told for k in sums.keys() | told[0].keys() if sums.get(k) != told[0].get(k))
                 raise ValueError(f"{task}: the control {wrong} differs between {names}, of the same rows")
             shown = next((b for _, b in found if any(r["source"] == "imagenet" for r in b["records"])), found[0][1])
+            known = {_key(record): record["sums"] for record in shown["records"] if record["source"]}
             for name, block in found:
+                if others := {k[0] for r in block["records"] if known.get(k := _key(r), r["sums"]) != r["sums"]}:
+                    text = f"{task}: {', '.join(sorted(others))} of the result of {name} differ from those shown"
+                    not_run.append(f"{text}: made on another machine, or edited")
                 mine = records_of(block, results[name]["encoder"])
                 records += [r for r in mine if r["source"] == name or block is shown]
             rows += _rows(task, found[0][1]["group_by"], records, suite.probes[0], ask)
     return Board(results, rows, not_run)
+
+
+def _key(record: dict[str, Any]) -> tuple[Any, ...]:
+    return record["source"], record["modality"], record["probe"], record["seed"]
 
 
 def _rows(task: str, by: str, records: list[dict[str, Any]], probe: str, ask: SuiteTask) -> list[Row]:

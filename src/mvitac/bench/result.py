@@ -12,6 +12,7 @@ The digest shows that a file was changed by accident or by hand. It does not sho
 someone repeats them.
 """
 
+import itertools
 import json
 import re
 from collections import Counter
@@ -147,6 +148,12 @@ def problems(value: dict[str, Any]) -> list[str]:
     suite, encoder = suite_of(value), value["encoder"]
     found = list(problems_of(encoder, (*CONTROLS, GUESS)))
     found += unknown_fields(value, [(value, (*FIELDS, "blocks")), *((block, BLOCK) for block in value["blocks"])])
+    several: dict[tuple[str, int | None], list[Any]] = {}
+    for record in (record for block in value["blocks"] for record in block.get("records", ())):
+        several.setdefault((record["source"], record["seed"]), []).append(record["sums"])
+    for (one, first), (other, second) in itertools.combinations(several, 2):
+        if one == other and several[one, first] == several[other, second] and len(several[one, first]) > 1:
+            found.append(f"{one or 'the encoder'} has the same sums in every record of seeds {first} and {second}")
     asked = [(one, ask) for one in suite.sets for ask in one.tasks]
     if (want := [(s.name, t.name) for s, t in asked]) != (have := [(b["set"], b["task"]) for b in value["blocks"]]):
         return [*found, f"has the tasks {have}, the suite asks for {want}"]
@@ -188,8 +195,9 @@ def _untrue(modalities: Sequence[str], why: str, encoder: dict[str, Any], reads:
 def unknown_fields(value: dict[str, Any], parts: Sequence[tuple[dict[str, Any], Sequence[str]]]) -> Iterator[str]:
     """Fields of ``parts``, and of what all results have, that nobody reads."""
     encoder, versions = value["encoder"], value["versions"]
-    if not isinstance(versions, dict) or not all(isinstance(text, str) for text in versions.values()):
-        yield "its versions are no texts"
+    texts = [*versions.values()] if isinstance(versions, dict) else [None]
+    if not all(isinstance(text, str) for text in texts) or not {"mvitac", "torch"} <= versions.keys():
+        yield "its versions are no texts, or lack mvitac or torch"
     shared = (value.get("about", {}), ABOUT), (encoder, ENCODER), (encoder.get("external", {}), EXTERNAL)
     for fields, known in (*shared, *parts):
         yield from (f"has the unknown field {name!r}" for name in sorted(fields.keys() - {*known}))
@@ -213,7 +221,7 @@ def problems_of(encoder: dict[str, Any], controls: Sequence[str]) -> Iterator[st
     seeds, weights = encoder["seeds"], encoder["weights"]
     seen = 0 if encoder["images_seen"] is None else encoder["images_seen"]
     numbers = {"images_seen": seen, "size": encoder["size"], **encoder["parameters"]}
-    yield from (f"{key} is {number}" for key, number in numbers.items() if not 0 <= number < 1e18)
+    yield from (f"{key} is {n}" for key, n in numbers.items() if type(n) is not int or not 0 <= n < 1e18)
     texts = {key: encoder.get(key) for key in ("licence", "trained_on")}
     yield from (f"{key} is no text" for key, text in texts.items() if not isinstance(text, str | None))
     if not are_digests(weights):

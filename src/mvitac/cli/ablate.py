@@ -11,6 +11,7 @@ from mvitac.control.ablate import ablate as compare
 from mvitac.control.result import find_suite, shipped
 from mvitac.control.video import film, webp
 from mvitac.data.pack import Pack
+from mvitac.system.files import write_atomic
 from mvitac.system.progress import shown
 
 
@@ -35,6 +36,8 @@ def ablate(argv: list[str]) -> None:
     options = parse(_Options, argv, "ablate")
     check_json(options.json)
     check_json(options.out, "--out")
+    if options.out and options.out.suffix != ".webp":
+        raise ValueError(f"--out {options.out}: give the name of a .webp file")
     name, *cell = str(options.data).split("/")
     if name in shipped():
         suite, cell = find_suite(name), tuple(cell)
@@ -46,8 +49,10 @@ def ablate(argv: list[str]) -> None:
         policy, episodes = open_policy(options.policy), read_episodes(Pack(options.data))
     with shown():
         result = compare(policy, episodes)
-    if options.out:
-        runs = [("as it is", policy, ""), ("touch of another episode", policy, PLAUSIBLE[0])]
-        options.out.write_bytes(webp(film(episodes, runs)))
     print(report(result), file=printed_to(options.json))
     save_json(options.json, result, sealed=True)
+    if options.out:
+        other = ("touch of another episode", policy, PLAUSIBLE[0])
+        runs = [("as it is", policy, ""), *[other] * ("touch" in episodes.senses)]
+        write_atomic(options.out, lambda file: file.write(webp(film(episodes, runs))))
+        print(f"written: {options.out}", file=printed_to(options.json))

@@ -90,6 +90,8 @@ def compare(argv: list[str]) -> None:
     changes = {**plan.set, **dict(setting(text) for text in options.set)}
     plan = replace(plan.only(options.rows), recipe=recipe, set=changes, **same)
     config = ProbeConfig(probes=plan.probes, tasks=plan.tasks, modalities=plan.modalities)
+    if options.dry_run and options.tables_only:
+        raise ValueError("--tables-only has no effect beside --dry-run: leave one out")
     if not options.dry_run:
         check_place(options.out / "plan.json")
     works = lay_out_folds(plan, options.out, config, options.device)

@@ -102,7 +102,7 @@ def _problems(value: dict[str, Any], suite: Suite) -> Iterator[str]:
     parts = [(value, (*FIELDS, "data", "rows")), *((row, ("source", "seed", "cells")) for row in value["rows"])]
     cells = [cell for row in value["rows"] for cell in row["cells"]]
     yield from unknown_fields(value, [*parts, *((cell, ("task", "condition", "n", *suite.sums)) for cell in cells)])
-    if not value["data"] or not are_digests(value["data"].values()):
+    if value["data"].keys() != suite.shown[0].keys() or not are_digests(value["data"].values()):
         yield "it has no digests of what was learned from"
     yield from problems_of(value["encoder"], ["imagenet", *(source for source, _ in (*want, *rest))])
     for row in value["rows"]:
@@ -113,13 +113,22 @@ def _problems(value: dict[str, Any], suite: Suite) -> Iterator[str]:
             if {type(number) for key in ("n", *suite.sums) for number in cell[key]} - {int, float}:
                 yield f"{who}, {cell['task']}, {cell['condition']}: a sum is no number"
                 continue
+            if {len(cell[key]) for key in ("n", *suite.sums)} != {suite.num}:
+                yield f"{who}, {cell['task']}, {cell['condition']}: its sums are not of {suite.num} episodes"
+                continue
             n, *sums = np.array([cell[key] for key in ("n", *suite.sums)], float)
-            whole = len(n) == suite.num and (n == suite.scored).all() and np.isfinite(sums).all()
+            whole = (n == suite.scored).all() and np.isfinite(sums).all()
             if not whole or suite.impossible(cell["task"], n, np.array(sums)):
                 yield f"{who}, {cell['task']}, {cell['condition']}: no episodes give these sums"
-    rows = [(row["source"], row["cells"]) for row in value["rows"]]
-    for name in {row[0] for row in rows if rows.count(row) > 1}:
-        yield f"{name or 'the encoder'} has two seeds with the same sums in every cell"
+    told: dict[Any, str] = {}
+    free = suite.true, suite.blind  # which do not see what differs between conditions
+    for row in sorted(value["rows"], key=lambda row: row["source"] not in free):
+        for cell in row["cells"]:
+            who = f"{row['source'] or 'the encoder'}, seed {row['seed']}, {cell['task']}, {cell['condition']}"
+            own = cell["task"], *(tuple(cell[key]) for key in suite.sums)
+            same = told.setdefault(own, who) != who and row["source"] not in free
+            if same and any(len({*cell[key]}) > 1 for key in suite.sums):  # not where all lose contact at once
+                yield f"{who} has the sums of {told[own]}"
     true = next(row["cells"] for row in value["rows"] if row["source"] == suite.true)
     for cell, again in zip(true, score(suite, Row(suite.true, None, None)), strict=True):
         if not np.allclose(*([one[key] for key in suite.sums] for one in (cell, again)), rtol=1e-3, atol=1e-3):

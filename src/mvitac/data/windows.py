@@ -111,11 +111,13 @@ def places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
     asked = (window.order,) if window.order else ORDER
     name = next((column for column in asked if column in pack.table.column_names), None)
     if name is None:
-        raise ValueError(f"{pack.path} has no {', '.join(asked)} to order frames: train with another --data.order")
+        raise ValueError(f"{pack.path} has no {', '.join(asked)} to order frames: name another --data.order")
     place = np.array([_number(cell) for cell in pack.column(name)])
     if not np.isfinite(place).all():
         row = int(np.flatnonzero(~np.isfinite(place))[0])
-        raise ValueError(f"frames: column {name!r} is not a number in row {row}: give all rows one, or another order")
+        raise ValueError(
+            f"{pack.path}: column {name!r} is not a number in row {row}: give all rows one, or another order"
+        )
     return name, place
 
 
