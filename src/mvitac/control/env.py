@@ -11,9 +11,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from mvitac.control.ablate import suite_episodes
 from mvitac.control.result import find_suite
-from mvitac.control.suite import OWN
-from mvitac.registry import check_known
 
 
 class LoopEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
@@ -28,9 +27,7 @@ class LoopEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
 
     def __init__(self, suite: str, task: str, condition: str, render_mode: str | None = "rgb_array") -> None:
         self.suite, self.cell, self.render_mode = find_suite(suite), (task, condition), render_mode
-        known = [*map("/".join, self.suite.cells(OWN))]
-        check_known(f"task and condition of {suite}", ["/".join(self.cell)], known)
-        self.world: Any = self.suite.world(*self.cell, 0)
+        self.world: Any = suite_episodes(self.suite, self.cell).begin[0]()
         images: Any = {sense: spaces.Box(0, 255, self.world.look(sense).shape, np.uint8) for sense in self.world.senses}
         self.observation_space: Any = spaces.Dict(images)
         self.action_space: Any = spaces.Box(-1, 1, self.world.most.shape, np.float32)

@@ -132,13 +132,11 @@ def quantise(path: Path, inputs: list[str], examples: list[list[np.ndarray]]) ->
     from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
     from onnxruntime.quantization.shape_inference import quant_pre_process
 
-    class Reader(CalibrationDataReader):
-        def __init__(self) -> None:
-            self.left = iter(examples)
+    left = (dict(zip(inputs, example, strict=True)) for example in examples)
 
+    class Reader(CalibrationDataReader):
         def get_next(self) -> dict[str, np.ndarray] | None:  # type: ignore[override]
-            example = next(self.left, None)
-            return None if example is None else dict(zip(inputs, example, strict=True))
+            return next(left, None)
 
     prepared = path.with_name("prepared.onnx")
     quant_pre_process(str(path), str(prepared), skip_symbolic_shape=True)

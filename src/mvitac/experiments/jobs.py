@@ -82,13 +82,8 @@ def do(job: Job, pack: Pack | None = None, *, quiet: bool = True) -> str:
             write_json(job.out / "failed.json", {"error": str(error)}, sealed=True)
             return f"diverged: {error}"
         result = probe_runs([job.out], job.session, pack)
-        scores = {
-            "asked": job.asked,
-            "of": job.run.digest(),
-            "records": result["records"],
-            "retrieval": result["retrieval"],
-        }
-        write_json(job.out / "scores.json", scores, sealed=True)
+        scores = {key: result[key] for key in ("records", "retrieval")}
+        write_json(job.out / "scores.json", {"asked": job.asked, "of": job.run.digest(), **scores}, sealed=True)
         for name in (CHECKPOINT, PREVIOUS):  # a scored run needs none, and one is four times as large as the weights
             (job.out / name).unlink(missing_ok=True)
         return f"{job.seconds():.0f} s of training"
