@@ -111,7 +111,6 @@ class Suite:
         return value
 
     def digest(self) -> str:
-        """Digest of the definition."""
         return digest(self.definition())
 
 

@@ -123,7 +123,6 @@ def _touched(pack: Pack, rows: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def suite_episodes(suite: Any, cell: tuple[str, ...]) -> Episodes:
-    """The episodes of a suite of one task and condition."""
     check_known(f"task and condition of {suite.name}", ["/".join(cell)], [*map("/".join, suite.cells(OWN))])
     begin = [partial(suite.world, *cell, number) for number in range(suite.num)]
     return Episodes(begin, begin[0]().senses, unit=suite.failure)

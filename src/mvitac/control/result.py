@@ -43,7 +43,6 @@ def shipped() -> list[str]:
 
 
 def find_suite(name: str) -> Suite:
-    """The suite ``name`` of this version."""
     check_known("suite", [name], shipped())
     value = tomllib.loads((SUITES / f"{name}.toml").read_text())
     return from_json(Insert if value["kind"] == "insert" else Servo, value, "suite")
@@ -73,7 +72,6 @@ def run_suite(places: Sequence[str], suite: Suite, out: Path, about: About) -> P
 
 
 def is_result(path: Path) -> bool:
-    """Whether ``path`` is a result of a closed-loop suite."""
     value = read_json(path, "a result")
     return isinstance(value, dict) and value.get("format") == FORM[0]
 

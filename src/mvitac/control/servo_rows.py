@@ -68,7 +68,6 @@ class Servo(LoopSuite):
         return self.steps - self.settle
 
     def cells(self, source: str) -> list[Cell]:
-        """The tasks and conditions that a row has."""
         return [(kind, condition.name) for kind in self.kinds for condition in self.conditions]
 
     def world(self, task: str, condition: str, number: int) -> "Episode":

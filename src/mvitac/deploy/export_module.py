@@ -156,7 +156,6 @@ def quantise(path: Path, inputs: list[str], examples: list[list[np.ndarray]]) ->
 
 
 def output_of(probe: LinearProbe) -> str:
-    """The name of the output of a probe."""
     kind = "probability" if isinstance(probe.info, ProbeInfo) else "value"
     return f"{kind}_{probe.info.task}"
 

@@ -41,7 +41,6 @@ class Plan:
     """What is compared with what."""
 
     name: str
-    """Name of the plan."""
     rows: tuple[Row, ...]
     """The lines of the table, in order."""
     title: str = ""

@@ -83,8 +83,7 @@ class Stream:
             self._say("damaged frame", f"skipped a damaged frame ({brief(error)})")
             return
         except Exception as error:  # OSError, or one of the exceptions of OpenCV and its drivers
-            self.origin.close()
-            self._open = False
+            self.close()
             self._retry_at = self.clock() + RETRY_EVERY
             if self.fault != "unplugged":
                 self._arrivals.clear()

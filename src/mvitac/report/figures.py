@@ -37,7 +37,6 @@ def new_figure(title: str, height: float, width: float = WIDTH) -> tuple[Figure,
 
 
 def shorten(text: str, length: int) -> str:
-    """``text`` in at most ``length`` characters."""
     return text if len(text) <= length else text[: length - 1] + "…"
 
 
@@ -70,15 +69,14 @@ def bars(
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.grid(axis="x")
     axes.spines["left"].set_visible(False)
-    labels, handles = [], []
+    handles = []
     for number, (name, value) in enumerate(lines.items()):
         look: dict[str, Any] = {"color": COLOURS["soft"], "linestyle": DASHES[1 + number % 3]}
         for low, high in spans:  # not through the names of the groups
             axes.plot([100 * max(least, value)] * 2, [low, high], linewidth=1.2, zorder=0.9, **look)
-        handles.append(Line2D([], [], **look))
-        labels.append(f"{shorten(name, 28)} {percent(value)}")
+        handles.append(Line2D([], [], label=f"{shorten(name, 28)} {percent(value)}", **look))
     if handles:
-        figure.legend(handles, labels, loc=BELOW, ncols=3)
+        figure.legend(handles=handles, loc=BELOW, ncols=3)
     return figure
 
 

@@ -217,7 +217,6 @@ def _described(part: ExternalEncoder) -> dict[str, Any]:
 
 
 def is_noncommercial(licence: str) -> bool:
-    """Whether the weights' licence forbids commercial use."""
     return "nc" in licence.lower().split(" (")[0].replace("_", "-").split("-")
 
 
