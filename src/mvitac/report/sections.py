@@ -49,9 +49,6 @@ class Study:
         """Names of the methods in the probe result. Every other source is a control."""
         return list(dict.fromkeys(run.source for run in self.runs))
 
-    def hue(self, run: Finished) -> str:
-        return HUES[self.sources.index(run.source) % len(HUES)]
-
     def rows(self) -> tuple[str, np.ndarray]:
         """The split to show and its rows: test, as scored by the first task and by retrieval, else another."""
         for split in ("test", "val", "train", "unlabelled"):
@@ -95,7 +92,8 @@ def loss(study: Study) -> list[Markup]:
     series = [(r, entries) for r in study.runs if (entries := [entry for entry in r.log if "loss" in entry])]
     if not series:
         return [html.paragraph("The runs left no log lines.")]
-    total = [Line(r.source, *_column(entries, "loss"), study.hue(r)) for r, entries in series]
+    hues = dict(zip(study.sources, itertools.cycle(HUES), strict=False))
+    total = [Line(r.source, *_column(entries, "loss"), hues[r.source]) for r, entries in series]
     drawn = [study.figure("loss", figures.curves("loss", total), "Total loss over the steps")]
     for source in study.sources:
         drawn += _loss_parts(study, source, [(r, entries) for r, entries in series if r.source == source])
@@ -108,7 +106,7 @@ def _loss_parts(study: Study, source: str, series: Sequence[tuple[Finished, list
     names = [name for name in series[0][1][0] if name not in _NOT_LOSS] if series else []
     if len(names) < 2:
         return []
-    hues = {name: HUES[i % len(HUES)] for i, name in enumerate(names)}
+    hues = dict(zip(names, itertools.cycle(HUES), strict=False))
     lines = [Line(name, *_column(entries, name), hue) for name, hue in hues.items() for _, entries in series]
     batch, caption, chance = series[0][0].run.batch_size, "", {}
     if set(names) <= {"vv", "tt", "vt", "tv"}:  # InfoNCE has a known chance level
