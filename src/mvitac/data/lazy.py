@@ -26,7 +26,6 @@ class Lazy(ABC):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all images in memory."""
         return int(np.prod(self.shape, dtype=np.int64))
 
     def __getitem__(self, index: Any) -> np.ndarray:

@@ -162,7 +162,6 @@ LIMITS = {"size": (8, 1024), "workers": (0, 1024), "max_damaged": (0, 1), "quali
 
 
 def check_request(store: str = "raw", **given: float) -> None:
-    """Raise ValueError for invalid packing options."""
     for name, value in given.items():
         low, high = LIMITS[name]
         if not low <= value <= high:

@@ -76,7 +76,6 @@ class DatasetConfig(Registered):
         return Window(frames=self.num_frames, of=of, **same)
 
     def build_options(self) -> dict[str, Any]:
-        """How ``build`` stores the pack."""
         return {name: getattr(self, name) for name in ("size", "workers", "store", "quality")}
 
     def source(self) -> "Source":
@@ -100,7 +99,6 @@ class DatasetConfig(Registered):
         return windowed(self._frames(quiet), self.frame_window())
 
     def _frames(self, quiet: bool) -> Pack:
-        """Return the pack of single frames."""
         source = self.source()
         path = self.place(source)
         if path.exists():

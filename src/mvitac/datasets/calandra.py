@@ -206,7 +206,6 @@ class Calandra(Source):
 
 
 def list_grasps(file: Path) -> list[Grasp]:
-    """Return every grasp of a shard with name and outcome."""
     import h5py
 
     try:

@@ -51,7 +51,6 @@ class SlipGraspConfig(RowsConfig):
 
 
 def _grasps(root: Path, file: Path) -> list[dict[str, str]]:
-    """Return the pairs of all grasps of one object."""
     name = file.name[len("object") : -len("_result.dat")]
     rows: list[dict[str, str]] = []
     widths: dict[str, float] = {}

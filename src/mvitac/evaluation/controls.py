@@ -140,7 +140,6 @@ def label_controls(
 def pixel_controls(
     pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str], probes: Sequence[str] = ("linear",)
 ) -> Records:
-    """Thumbnails of every modality, and the border of the tactile image."""
     found = probe_all(partial(thumbnails, pack), pack, tasks, modalities, probes, 0)
     records = _named("pixels", None, found)
     if "touch" in modalities:

@@ -21,7 +21,6 @@ Bound = tuple[Any, Pack]  # an encoder, as ``bench.external.ExternalModel``, and
 
 
 def is_encoder(text: object) -> bool:
-    """Whether ``text`` names an encoder of other people."""
     return isinstance(text, str) and text.partition(":")[0] in OPENERS
 
 

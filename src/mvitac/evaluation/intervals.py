@@ -97,7 +97,6 @@ def least_p(num_groups: int) -> float:
 
 
 def num_groups_of(record: dict[str, Any]) -> int:
-    """Number of test groups that a record scored."""
     return int(np.count_nonzero(_sizes(record)))
 
 

@@ -89,7 +89,6 @@ def write_sources(folder: Path, sources: Sequence[Source]) -> None:
 
 
 def sources_digest(sources: Sequence[Source]) -> str:
-    """Content address of the list."""
     return digest([[source.name, *(getattr(source, key).tolist() for key in KEYS)] for source in sources])
 
 

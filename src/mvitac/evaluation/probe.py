@@ -44,12 +44,10 @@ class ProbeSplit:
 
     @property
     def fitted(self) -> np.ndarray:
-        """Training and validation rows."""
         return np.concatenate([self.train, self.val])
 
     @property
     def all(self) -> np.ndarray:
-        """Training, validation and test rows, in this order."""
         return np.concatenate([self.train, self.val, self.test])
 
 
@@ -267,7 +265,6 @@ def probe_all(
 
 
 def probes_of(task: AnyTask, probes: Sequence[str]) -> list[str]:
-    """Those of ``probes`` that ``task`` can have."""
     return [kind for kind in probes if isinstance(task, Task) or kind in VALUE_PROBES or percent_of(kind)]
 
 

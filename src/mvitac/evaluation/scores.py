@@ -55,7 +55,6 @@ def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
 
 
 def grouped(records: Sequence[dict[str, Any]], keys: Sequence[str]) -> list[list[dict[str, Any]]]:
-    """Lists of the records that have the same values of ``keys``."""
     found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for record in records:
         found.setdefault(tuple(record[key] for key in keys), []).append(record)

@@ -62,7 +62,6 @@ def pool_values(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def one_target(record: dict[str, Any], t: int) -> dict[str, Any]:
-    """The record of target ``t`` alone."""
     sums = {name: [found[t]] for name, found in record["group_sums"].items()}
     target = record["targets"][t]
     points = {"points": [record["points"][t]]} if "points" in record else {}

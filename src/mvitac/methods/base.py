@@ -198,7 +198,6 @@ class MethodConfig(Registered, ABC):
         return rows
 
     def check_complete(self, pack: Pack, rows: np.ndarray, modalities: tuple[str, ...]) -> None:
-        """Raise ValueError unless all of ``rows`` have all of ``modalities``."""
         for modality in modalities:
             lacking = rows[~pack.has(modality)[rows]]
             if len(lacking):

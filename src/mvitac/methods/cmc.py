@@ -52,7 +52,6 @@ class CMCConfig(MethodConfig):
     """Width of the embeddings (TAG: 128)."""
 
     def negatives(self, num_rows: int) -> int:
-        """Number of negatives when training on ``num_rows`` rows."""
         return min(self.num_negatives, max(1, int(NEGATIVES_PER_ROW * num_rows)))
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "CMC":

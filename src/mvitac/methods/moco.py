@@ -41,7 +41,6 @@ class QueueConfig(MethodConfig, ABC):
     """BatchNorm after the first layer of the heads (MoCo v2: none)."""
 
     def queue_size(self, num_rows: int) -> int:
-        """Number of keys to keep when training on ``num_rows`` rows."""
         return min(self.queue, max(1, int(KEYS_PER_ROW * num_rows)))
 
 

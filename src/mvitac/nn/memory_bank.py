@@ -40,7 +40,6 @@ class Bank(nn.Module):
         self.register_buffer("values", torch.empty(num_rows, width).uniform_(-bound, bound))
 
     def dots(self, query: Float[Tensor, "B D"], at: Int[Tensor, "B K"]) -> Float[Tensor, "B K"]:
-        """Inner products of queries with the rows ``at``."""
         # Multiply with all rows, then select the drawn ones: the same numbers as gathering B x K rows, in far less memory.
         return (query @ self.values.T).gather(1, at)
 

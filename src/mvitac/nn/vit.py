@@ -72,7 +72,6 @@ def build_vits(config: Encoders, spec: DataSpec, method: str) -> nn.ModuleDict:
 
 
 def vit_of(trunk: nn.Module) -> VisionTransformer:
-    """A trunk from ``build_vits`` by its type."""
     return trunk  # type: ignore[return-value]
 
 
@@ -89,7 +88,6 @@ def patches(trunk: nn.Module, images: Tensor) -> Float[Tensor, "B N P"]:
 
 
 def take(tokens: Float[Tensor, "B N D"], at: Int[Tensor, "B K"]) -> Float[Tensor, "B K D"]:
-    """The tokens at the places ``at`` of each row."""
     return tokens.gather(1, at[:, :, None].expand(-1, -1, tokens.shape[2]))
 
 

@@ -74,7 +74,6 @@ class Augment:
                 raise ValueError(f"augment size or whole {side}: give a side of 8 to 1024 pixels")
 
     def of(self, modality: str) -> ViewAugment:
-        """The views of ``modality``."""
         return self.vision if modality == "vision" else self.touch
 
     def size_of(self, modality: str) -> int:

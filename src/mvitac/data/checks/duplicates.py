@@ -16,7 +16,6 @@ MAX_ASKED, MAX_SEARCHED = 2000, 40_000
 
 
 def exact_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
-    """Find identical images in different splits."""
     sides = sides_of(pack.column("split").astype(str))
     notes, rows = [], []
     for name, one in looks.items():

@@ -15,7 +15,6 @@ Draw = Callable[[Pack, Sequence[Finding]], None]  # draws a contact sheet
 
 
 def examine(pack: Pack) -> list[Finding]:
-    """Run every check on ``pack``."""
     looks = look_at(pack)
     return [
         table_checks.unreadable(pack),

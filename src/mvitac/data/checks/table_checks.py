@@ -17,7 +17,6 @@ PACKED = ("label_", "has_", "crc_", "bytes_")  # what the columns that packing a
 
 
 def unreadable(pack: Pack) -> Finding:
-    """List items that packing could not read."""
     damaged = pack.meta.get("damaged", [])
     evidence = f"{len(damaged)}; {pack.num} rows were read" + (f"; first {': '.join(damaged[0])}" if damaged else "")
     advice = "repair them or download them again; the pack does not contain them"
@@ -25,7 +24,6 @@ def unreadable(pack: Pack) -> Finding:
 
 
 def missing_images(pack: Pack) -> Finding:
-    """Count rows without an image of a modality that the dataset has."""
     has = {modality: pack.has(modality) for modality in pack.spec.modalities}
     notes = [f"{share(int((~h).sum()), pack.num)} rows have no {m}" for m, h in has.items() if not h.all()]
     empty = [(split, m) for m, h in has.items() for split in ("train", "test") if not h[pack.rows(split)].any()]

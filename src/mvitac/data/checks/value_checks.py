@@ -17,7 +17,6 @@ reported if more than this share of them is (measured on the 33 grasps of docs/v
 
 
 def values(pack: Pack) -> list[Finding]:
-    """Return one finding per target of a task with values."""
     touches = _touches(pack)
     asked = [(task, t) for task in pack.spec.values for t in range(len(task.targets))]
     return [_finding(pack, task, task.targets[t], pack.values(task)[:, t], touches) for task, t in asked]

@@ -128,7 +128,6 @@ class Row:
     columns: dict[str, Any]
 
     def refs(self) -> Iterator[ImageRef]:
-        """Yield the reference of every image that is needed."""
         yield from (ref for ref in (self.vision, *self.touch) if ref)
         yield from (ref for many in self.background for ref in many)
 

@@ -73,7 +73,6 @@ class Manifest:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The names of all columns."""
         return tuple(dict.fromkeys((*self.rows[0], *self.images)))
 
     def check(self, *columns: str | None, images: bool = False) -> None:
@@ -180,7 +179,6 @@ def in_clone(path: Path, inside: str, pattern: str, url: str) -> Path:
 
 
 def read_manifest(file: Path) -> Manifest:
-    """Read a table with named columns."""
     try:
         if file.suffix.lower() not in READERS or (file.exists() and not file.is_file()):  # a pipe never ends
             raise ValueError(f"it is no file of {', '.join(READERS)}")
