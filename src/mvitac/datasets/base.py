@@ -57,10 +57,8 @@ class DatasetConfig(Registered):
     def __post_init__(self) -> None:
         for name in ("stride", "frames_of", *["order"] * (not self.minus_first)) * (self.num_frames == 1):
             if getattr(self, name) != getattr(DatasetConfig, name):
-                option = f"--data.{name.replace('_', '-')}"
-                raise ValueError(
-                    f"{option} is for rows of several frames: give --data.num-frames to what reads the pack, or leave it out"
-                )
+                option = f"--data.{name.replace('_', '-')} is for rows of several frames"
+                raise ValueError(f"{option}: give --data.num-frames to what reads the pack, or leave it out")
         self.frame_window()
         check_request(self.store, size=self.size, workers=self.workers, quality=self.quality)
 

@@ -139,7 +139,7 @@ class Calandra(Source):
         shards = sorted(file for file in config.path.glob("*.h5") if SHARD.fullmatch(file.name))
         if not shards:
             raise ValueError(f"{config.path} has no calandra_corl2017_NNN.h5: download some (doi 10.25532/OPARA-700)")
-        self._files = {file: stamp_of(str(file)) for file in shards}
+        self._files = {file: one_stamp([stamp_of(str(file))]) for file in shards}
         everything = [grasp for file in self._files for grasp in list_grasps(file)]
         self._splits = split_objects(config, sorted({grasp.object for grasp in everything if not grasp.damage}))
         # Objects that the split leaves out are not read; damaged grasps are kept, to be listed.
@@ -167,8 +167,7 @@ class Calandra(Source):
         return {"reader": f"calandra {VERSION}", "files": files, "grasps": digest(known), "options": options}
 
     def stamps(self) -> list[int]:
-        numbers = {file: one_stamp([stamp]) for file, stamp in self._files.items()}
-        return [numbers[grasp.file] for grasp in self._grasps]
+        return [self._files[grasp.file] for grasp in self._grasps]
 
     def samples_per_item(self) -> list[int]:
         return [len(self.config.phases)] * len(self._grasps)

@@ -141,9 +141,8 @@ class LeRobotConfig(RecordedConfig):
         for file, parts in used.items():
             for (_, end, one), (start, _, other) in pairwise(sorted(parts)):
                 if start < end - 2e-3:
-                    raise ValueError(
-                        f"{self.path}: by meta/episodes, episodes {one} and {other} share frames of {file}"
-                    )
+                    two = f"episodes {one} and {other} share frames of {file}"
+                    raise ValueError(f"{self.path}: by meta/episodes, {two}")
         return places
 
 

@@ -52,10 +52,9 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         compared = True
         pairs, base = _near_pairs(residuals, asked, bank, groups, one.exact)
         rate = len(pairs) / len(asked)
-        notes.append(
-            f"{name}: {share(len(pairs), len(asked))} of the held-out rows that are clear enough to compare nearly repeat"
-            f" one of train ({100 * base:.1f} % between groups of train)"
-        )
+        repeat = "of the held-out rows that are clear enough to compare nearly repeat one of train"
+        natural = f"({100 * base:.1f} % between groups of train)"
+        notes.append(f"{name}: {share(len(pairs), len(asked))} {repeat} {natural}")
         suspicious |= rate > 0.01 or (len(pairs) >= 3 and rate > 3 * base)
         rows += pairs.ravel().tolist()
     item, evidence = "near-copies across splits", "; ".join(notes)

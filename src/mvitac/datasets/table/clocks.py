@@ -60,9 +60,8 @@ def times_of(video: Path) -> np.ndarray:
 def check_moves(stamps: np.ndarray, where: object) -> None:
     """Raise ValueError if a clock stands still: everything would be joined to one image or measurement."""
     if len(stamps) > 1 and np.ptp(stamps) == 0:
-        raise ValueError(
-            f"{where}: all {len(stamps)} times are {stamps[0]:.10g} s: a clock that stands still pairs nothing"
-        )
+        same = f"all {len(stamps)} times are {stamps[0]:.10g} s"
+        raise ValueError(f"{where}: {same}: a clock that stands still pairs nothing")
 
 
 def row_times(table: Manifest, column: str, refs: Sequence[ImageRef | None]) -> tuple[np.ndarray, list[str]]:

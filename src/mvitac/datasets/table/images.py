@@ -113,9 +113,6 @@ def check_files(table: Manifest, columns: Sequence[str], grounds: Sequence[Backg
     return stamps
 
 
-Loaded = dict[ImageRef, np.ndarray]  # images at the stored size
-
-
 @dataclass(frozen=True, slots=True)
 class Row:
     """One sample before its images are read: where they are, and the row's columns in the pack."""
@@ -176,6 +173,6 @@ def read_rows(rows: Sequence[Row], size: int) -> list[Sample | Lost]:
     return samples
 
 
-def _load(refs: Sequence[ImageRef], size: int, lost: Damage) -> Loaded:
+def _load(refs: Sequence[ImageRef], size: int, lost: Damage) -> dict[ImageRef, np.ndarray]:
     """Read images at the stored size (a whole video would not fit otherwise); damaged ones are put in ``lost``."""
     return {ref: shrink(image, size) for ref, image in read_all(refs, lost)}

@@ -255,9 +255,8 @@ class Rows(Source):
         """ValueError for an option that changes nothing of this table."""
         config, listed = self._config, table.path.suffix.lower() in READERS
         idle: dict[str, Any] = {"pictures": listed and "the table names its images"}
-        idle |= dict.fromkeys(
-            ("tolerance", "interpolate"), listed and not config.log and "--data.log names no other clock"
-        )
+        alone = listed and not config.log and "--data.log names no other clock"
+        idle |= dict.fromkeys(("tolerance", "interpolate"), alone)
         given = self._split != BY_GROUP and f"column {self._split!r} says the split"
         idle |= dict.fromkeys(("test_share", "val_share", "split_seed"), given)
         for name, why in idle.items():
