@@ -200,7 +200,6 @@ class _Partial:
         self.parts.append(part)
 
     def finish(self, num_items: int, max_damaged: float) -> None:
-        """Complete the pack in the folder ``pack``."""
         folder, num = self.folder / "pack", sum(len(part.columns) for part in self.parts)
         damaged = self._check_damage(num_items, num, max_damaged)
         self._write_headers(num)

@@ -119,7 +119,6 @@ def pack_features(
 
 
 def _folded(model: Model, modality: str) -> Model:
-    """``model`` with another encoder of ``modality``: ``folded``."""
     encoders, made = {**model.encoders, modality: folded(model.encoders[modality])}, copy.copy(model)
     made._modules = {**model._modules, "encoders": nn.ModuleDict(encoders)}
     return made

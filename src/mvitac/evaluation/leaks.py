@@ -81,7 +81,6 @@ def with_ancestors(own: Source, ancestors: Sequence[Source]) -> list[Source]:
 
 
 def write_sources(folder: Path, sources: Sequence[Source]) -> None:
-    """Write what the run in ``folder`` learns from."""
     arrays = {f"{i}.{key}": getattr(source, key) for i, source in enumerate(sources) for key in KEYS}
     arrays[SEAL] = np.frombuffer(bytes.fromhex(sources_digest(sources)), np.uint8)
     data = safetensors.numpy.save(arrays, metadata={str(i): source.name for i, source in enumerate(sources)})

@@ -83,9 +83,8 @@ def columns_of(task: dict[str, Any]) -> list[str]:
 
 def sources_of(task: dict[str, Any]) -> list[str]:
     """Methods in order of appearance, then controls from the strongest idea to the weakest."""
-    found = dict.fromkeys(source for modality in task.values() for source in modality)
-    fixed = sorted(task.get("none", {}), key=lambda s: s in ("majority", "mean"))
-    return [*methods_of(task), *(s for s in SHARED if s in found), *fixed]
+    shared = [source for source in SHARED if any(source in cells for cells in task.values())]
+    return [*methods_of(task), *shared, *sorted(task.get("none", {}), key=lambda s: s in ("majority", "mean"))]
 
 
 def methods_of(task: dict[str, Any]) -> list[str]:

@@ -153,7 +153,6 @@ class Encoders:
         return self.vision if modality == "vision" else self.touch
 
     def changed(self, **fields: Any) -> "Encoders":
-        """These with the same new values of ``fields`` for both modalities."""
         return Encoders(vision=replace(self.vision, **fields), touch=replace(self.touch, **fields))
 
     def fresh(self) -> "Encoders":

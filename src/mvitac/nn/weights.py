@@ -132,7 +132,6 @@ def load_weights(network: nn.Module, tensors: State, file: Path | str) -> None:
 
 
 def below(start: str, tensors: State) -> State:
-    """The tensors whose names begin with ``start``, without it."""
     return {name.removeprefix(start): value for name, value in tensors.items() if name.startswith(start)}
 
 

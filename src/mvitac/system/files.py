@@ -49,7 +49,6 @@ _STALE = 600  # seconds after which nobody is still writing a temporary file
 
 
 def is_temporary(path: Path) -> bool:
-    """Return whether ``path`` has the name of a temporary file of ``write_atomic``."""
     return _TEMPORARY.fullmatch(path.name) is not None
 
 

@@ -16,7 +16,6 @@ LIBRARIES = (
 
 
 def provenance() -> dict[str, Any]:
-    """Return library versions, machine and git commit, to store with a result."""
     versions = {}
     for library in LIBRARIES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):

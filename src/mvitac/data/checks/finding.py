@@ -10,8 +10,6 @@ MAX_ROWS = 64
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one check."""
-
     item: str
     verdict: Verdict
     evidence: str  # what was measured, in one line

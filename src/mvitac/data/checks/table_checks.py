@@ -57,9 +57,8 @@ def labels(pack: Pack) -> list[Finding]:
         advice = ["assign the groups to splits again, or drop the classes"] * bool(unseen or unasked)
         advice += ["fill them in; fine if they are meant for pre-training only"] * bool(len(empty))
         advice += ["report balanced accuracy"] * bool(uneven)
-        findings.append(
-            judged(item, evidence, "; ".join(advice), empty.tolist(), look=bool(advice), broken=bool(unseen))
-        )
+        how = {"look": bool(advice), "broken": bool(unseen)}
+        findings.append(judged(item, evidence, "; ".join(advice), empty.tolist(), **how))
     return findings
 
 

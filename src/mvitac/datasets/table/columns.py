@@ -44,7 +44,6 @@ class Condition:
 
 
 def all_hold(conditions: Iterable[str], table: Manifest) -> list[bool]:
-    """Return, for each row, whether it meets all of ``conditions``."""
     parsed = [Condition.parse(text) for text in conditions]
     return [all(condition.holds(row) for condition in parsed) for row in table.rows]
 

@@ -117,7 +117,6 @@ def by_recording(listed: Sequence[Frame], shares: tuple[float, ...], seed: int) 
 
 
 def assign_by_recording(listed: Sequence[Frame], test_share: float, val_share: float, seed: int) -> None:
-    """Set the split of each frame to that of its recording, for all tasks."""
     splits = by_recording(listed, (1 - test_share - val_share, val_share, test_share), seed)
     for frame in listed:
         frame.split = frame.split_rough = ("train", "val", "test")[splits[frame.recording]]

@@ -76,7 +76,6 @@ class TouchAndGoConfig(DatasetConfig):
 
     @property
     def val_part(self) -> float:
-        """``val_share`` or its default."""
         return self.val_share if self.val_share is not None else 0.15 if self.split == "by-recording" else 0.0
 
     def source(self) -> Source:
@@ -194,7 +193,6 @@ class Recording:
     places: dict[str, Path]
 
     def stamps(self, numbers: Sequence[int]) -> Iterator[Stamp]:
-        """Yield the stamps of the files with frames ``numbers``."""
         for place in self.places.values():
             files = [str(place)] if place.suffix else [f"{place}/{number:010d}.jpg" for number in numbers]
             yield from map(stamp_of, files)
