@@ -74,7 +74,7 @@ def main() -> None:
     base = recipe("paper", config)
     run = replace(
         base,
-        encoder=Encoders.both(trunk=options.trunk, weights="scratch"),
+        encoder=Encoders().changed(trunk=options.trunk, weights="scratch"),
         augment=replace(base.augment, size=options.size),
     )
     model = fresh(run, pack.spec, options.size)

@@ -29,7 +29,7 @@ def main() -> None:
     given = json.loads(sys.argv[1])
     device, batch, part = torch.device(given["device"]), given["batch"], given["chunk"] or given["batch"]
     base = recipe("paper")
-    encoder = Encoders.both(trunk=given["trunk"], weights=SCRATCH)
+    encoder = Encoders().changed(trunk=given["trunk"], weights=SCRATCH)
     run = replace(base, encoder=encoder, batch_size=batch, chunk=given["chunk"], precision="bf16")
     shape = {"vision_channels": 3, "touch_channels": 3, "tasks": (), "group_by": "row"}
     spec = DataSpec(name="noise", licence="none", source="noise", **shape)

@@ -160,7 +160,7 @@ def known(rows: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
 def our_run(scale: Scale, precision: str, **changes: Any) -> Run:
     """Return recipe `paper` at this scale, without pretrained weights."""
     base = recipe("paper")
-    network = Encoders.both(trunk=scale.trunk, weights=SCRATCH)
+    network = Encoders().changed(trunk=scale.trunk, weights=SCRATCH)
     optim = replace(base.optim, lr=1e-3)
     views = replace(base.augment, size=scale.size)
     return replace(

@@ -73,7 +73,7 @@ def main(manifest: Path) -> None:
         for trunk in ("resnet10t", "resnet18"):
             run = recipe("quick", config, phased=False)
             augment = replace(run.augment, size=96, whole=128)
-            run = replace(run, encoder=Encoders.both(trunk=trunk, weights="scratch"), augment=augment)
+            run = replace(run, encoder=Encoders().changed(trunk=trunk, weights="scratch"), augment=augment)
             z = pack_features(fresh(run, pack.spec, pack.size), pack, "touch", every).numpy()
             left_out(pack, f"untrained {trunk}, {shown}", z)
     width, moved = pack.column("width_m").astype(float)[:, None], energy(pack)

@@ -39,11 +39,7 @@ class Model(nn.Module):
 
     ``embed`` and ``predict`` take raw images and compute no gradients. ``forward`` takes tensors, for further training.
 
-    Args:
-        method: The method, trained or not.
-        run: The run that trains it.
-        spec: Description of the training data.
-        stored: Side in pixels of the images in the training pack. Raw images are first resized to it.
+    ``stored`` is the side in pixels of the images in the training pack: raw images are first resized to it.
 
     Attributes:
         encoders: modality -> trunk.
@@ -135,12 +131,9 @@ class Model(nn.Module):
     def transform(self, modality: str, *, normalize: bool = False, background: ImageInput | None = None) -> Preprocess:
         """The preprocessing of one image as a function, e.g. for the dataset of a ``DataLoader``.
 
-        Args:
-            modality: vision or touch.
-            normalize: Return the normalised input of ``trunk`` instead of the images that ``forward`` takes.
-            background: For models trained on difference images: the sensor without contact, one image, to subtract.
-
-        Returns a function that can be pickled: image to uint8 [C, stored, stored], with ``normalize`` fp32 [C, S, S].
+        The function can be pickled. It returns what ``forward`` takes, uint8 [C, stored, stored], or with ``normalize`` what
+        ``trunk`` takes, fp32 [C, S, S]. ``background``, for models trained on difference images, is the sensor without
+        contact, one image, to subtract.
         """
         self.check_modality(modality)
         self._check_background(modality, background)
@@ -164,12 +157,9 @@ class Model(nn.Module):
     def features(self, modality: str, images: Tensor, *, for_heads: bool = False, bf16: bool = False) -> Tensor:
         """Pooled features [B, D], fp32, of images from a pack, without gradients.
 
-        Args:
-            modality: vision or touch.
-            images: uint8 [B, C, H, W], as a pack stores them, or floats in [0, 1].
-            for_heads: Compute the features that ``project`` and ``answer`` take. They see images at the size of the
-                training views (``Augment.size``), while probes see them at ``Augment.whole``.
-            bf16: Compute in bf16.
+        ``images`` are uint8 [B, C, H, W], as a pack stores them, or floats in [0, 1]. ``for_heads``: the features that
+        ``project`` and ``answer`` take, which see images at the size of the training views (``Augment.size``), while
+        probes see them at ``Augment.whole``.
         """
         images = check_images(images, self.spec.channels(modality), modality)
         with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
@@ -184,9 +174,7 @@ class Model(nn.Module):
     def answer(self, task: str, features: dict[str, Tensor]) -> Tensor:
         """Class probabilities [B, K], or values [B, T] in their units, from a head trained along by a supervised method.
 
-        Args:
-            task: One of ``tasks``.
-            features: modality -> ``features(..., for_heads=True)``.
+        ``task`` is one of ``tasks``; ``features``: modality -> ``features(..., for_heads=True)``.
         """
         head = self.classifiers[self.tasks.index(task)]
         found = head(torch.cat([features[m] for m in self.encoders], dim=1))
@@ -218,11 +206,8 @@ class Model(nn.Module):
                 ``touch`` must already be (touch - background) / 2 + 128.
             shared: Return embeddings in the space shared by both modalities, L2-normalised, instead of features.
 
-        Returns:
-            modality -> [N, D], or [N, E] with ``shared``.
-
-        Raises:
-            ValueError: If images do not fit the model, or the model is in training mode.
+        Returns modality -> [N, D], or [N, E] with ``shared``; ValueError if images do not fit the model, or it is in
+        training mode.
 
         Examples:
             >>> model.embed(touch=np.zeros((4, 240, 320, 3), np.uint8))["touch"].shape  # doctest: +SKIP
@@ -251,17 +236,10 @@ class Model(nn.Module):
     ) -> dict[str, Tensor]:
         """Classify or measure raw images with the probes of a published artifact.
 
-        Args:
-            vision: As for ``embed``. If both modalities are given, the probes on both are used.
-            touch: As for ``embed``.
-            background: As for ``embed``.
+        Images are given as for ``embed``. If both modalities are given, the probes on both are used.
 
-        Returns:
-            task -> class probabilities [N, K], or values [N, T] in the units of their targets. ``classes`` and ``targets``
-            name the columns.
-
-        Raises:
-            ValueError: As for ``embed``, or if the model has no probe on these modalities.
+        Returns task -> class probabilities [N, K], or values [N, T] in the units of their targets; ``classes`` and
+        ``targets`` name the columns. ValueError as for ``embed``, or if the model has no probe on these modalities.
         """
         given = self.embed(vision=vision, touch=touch, background=background)
         if len({len(features) for features in given.values()}) > 1:
@@ -313,7 +291,6 @@ class Model(nn.Module):
 
 
 def tensors_of(network: nn.Module) -> dict[str, Tensor]:
-    """The state dict of ``network``, on the CPU."""
     return {name: tensor.cpu().contiguous() for name, tensor in network.state_dict().items()}
 
 

@@ -100,7 +100,7 @@ def quick(data: DatasetConfig, phased: bool) -> Run:
         sampler="one-per-touch",
         method=MViTacConfig(head_norm=True, keys="end-to-end", pairs="all", momentum=0.9, temperature=0.2),
         optim=replace(base.optim, lr=1.4e-3),
-        encoder=Encoders.both(trunk="resnet10t", weights=SCRATCH),
+        encoder=Encoders().changed(trunk="resnet10t", weights=SCRATCH),
         augment=Augment(size=48, whole=72, vision=views, touch=replace(views, flip=0.0)),
         batch_size=32,
         steps=1350,
@@ -141,7 +141,7 @@ def smoke(data: DatasetConfig, phased: bool) -> Run:
     return replace(
         base,
         recipe="smoke",
-        encoder=Encoders.both(trunk="mvitac_tiny", weights=SCRATCH),
+        encoder=Encoders().changed(trunk="mvitac_tiny", weights=SCRATCH),
         method=MViTacConfig(hidden=32, out=16),
         optim=replace(base.optim, lr=2e-3),
         augment=replace(base.augment, size=32, whole=None, touch=base.augment.vision),

@@ -360,7 +360,7 @@ def test_a_thumbnail_is_the_mean_of_its_pixels_and_the_border_sees_nothing_of_th
 
 
 def test_frozen_trunks_are_imagenet_and_files_that_runs_started_from() -> None:
-    run = replace(recipe("smoke"), encoder=Encoders.both(trunk="mvitac_tiny", weights=SCRATCH))
+    run = replace(recipe("smoke"), encoder=Encoders().changed(trunk="mvitac_tiny", weights=SCRATCH))
     started = replace(run, encoder=run.encoder.changed(weights="b.pth"))
     found = frozen_trunks([run, started, started])
     assert [name for name, _ in found] == ["imagenet", "start"] and found[1][1].encoder == started.encoder
@@ -406,7 +406,7 @@ def test_the_scale_of_a_feature_does_not_matter_to_any_linear_probe() -> None:
 
 def test_an_untrained_trunk_stands_beside_every_modality_and_search() -> None:
     """Whatever the order of the runs, the control is of one that has all the others have."""
-    base = replace(recipe("smoke"), encoder=Encoders.both(trunk="mvitac_tiny", weights=SCRATCH))
+    base = replace(recipe("smoke"), encoder=Encoders().changed(trunk="mvitac_tiny", weights=SCRATCH))
     spec, again = Toy().spec(), replace(base, seed=1)
     touch, vision = (replace(base, method=SupervisedConfig(modalities=(m,))) for m in ("touch", "vision"))
     apart = with_method(base, "simclr")  # both modalities, no space that they share
@@ -423,7 +423,7 @@ def test_an_untrained_trunk_stands_beside_every_modality_and_search() -> None:
 def test_the_untrained_trunk_is_of_the_runs_own_data(tmp_path: Path) -> None:
     """A classifier of ``bright`` and a method of pairs, probed on touch alone without that label."""
     pack = toy_pack(tmp_path / "p", num=60, vision_channels=0)
-    base = replace(recipe("smoke"), encoder=Encoders.both(trunk="mvitac_tiny", weights=SCRATCH))
+    base = replace(recipe("smoke"), encoder=Encoders().changed(trunk="mvitac_tiny", weights=SCRATCH))
     runs = [replace(base, method=SupervisedConfig(tasks=("bright",))), with_method(replace(base, seed=1), "ssvtp")]
     pack.spec, own = replace(pack.spec, tasks=pack.spec.tasks[:1]), Toy().spec()
     records, retrieval = controls_of(runs, pack, pack.spec.tasks, ["touch"], ["knn"], specs=[own, own])

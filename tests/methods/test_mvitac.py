@@ -72,7 +72,7 @@ def test_every_key_parameter_and_buffer_follows() -> None:
 
 def test_heads_are_as_printed() -> None:
     """Appendix A: 512 -> hidden -> 128, ReLU after the first layer, nothing after the last."""
-    tower = MViTacConfig().build(Toy().spec(), Encoders.both(trunk="resnet18", weights=SCRATCH)).query["touch"]
+    tower = MViTacConfig().build(Toy().spec(), Encoders().changed(trunk="resnet18", weights=SCRATCH)).query["touch"]
     assert [type(layer).__name__ for layer in tower.intra] == ["Linear", "ReLU", "Linear"]
     assert (tower.intra[0].in_features, tower.inter[-1].out_features) == (512, 128)
     assert F.normalize(tower(torch.randn(2, 3, 32, 32))[0], dim=1).shape == (2, 128)

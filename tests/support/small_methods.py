@@ -11,8 +11,8 @@ from mvitac.nn.encoders import SCRATCH, Encoders
 from mvitac.registry import default
 from support.toy import Toy
 
-TINY = Encoders.both(trunk="mvitac_tiny", weights=SCRATCH)
-TINY_VIT = Encoders.both(trunk="mvitac_tiny_vit", weights=SCRATCH)
+TINY = Encoders().changed(trunk="mvitac_tiny", weights=SCRATCH)
+TINY_VIT = Encoders().changed(trunk="mvitac_tiny_vit", weights=SCRATCH)
 ROWS = torch.arange(3, 83)
 
 

@@ -177,7 +177,7 @@ def test_leaks_of_ancestors_are_told(pack: Pack, chain: dict[str, Path], capsys:
 
 def test_weights_of_a_file_may_hide_a_leak(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With ``--encoder.weights FILE``, too: nothing says what the file was trained on, so none can be excluded."""
-    encoder, file = Encoders.both(trunk="test_resnet.r160_in1k", weights="scratch"), tmp_path / "trunk.safetensors"
+    encoder, file = Encoders().changed(trunk="test_resnet.r160_in1k", weights="scratch"), tmp_path / "trunk.safetensors"
     save_file(build_trunk(encoder.touch, 3).state_dict(), file)
     run = smoke(pack, steps=1, eval_every=0)
     train(replace(run, encoder=encoder.changed(weights=str(file))), tmp_path / "run", quiet=True)

@@ -160,4 +160,4 @@ def test_layers_nearer_the_images_learn_more_slowly(decay_norms: bool) -> None:
         expected = before[name] - 1e-2 * share * (p.grad + decay * before[name])
         torch.testing.assert_close(p.detach(), expected, rtol=1e-5, atol=1e-7, msg=name)
     with pytest.raises(ValueError, match=r"layer_decay 1\.5: give a factor above 0, at most 1"):
-        Encoders.both(layer_decay=1.5)
+        Encoders().changed(layer_decay=1.5)

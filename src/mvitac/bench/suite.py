@@ -103,7 +103,6 @@ class Suite:
                 raise ValueError(f"suite {self.name!r}: of {', '.join(map(str, each))} one is there twice")
 
     def definition(self) -> dict[str, Any]:
-        """The suite as JSON, without its pins."""
         value = to_json(self)
         for one in value["sets"]:
             for form in one["forms"]:
@@ -115,7 +114,6 @@ class Suite:
 
 
 def shipped() -> list[str]:
-    """Names of the suites of this version."""
     return sorted(path.stem for path in SUITES.glob("*.toml"))
 
 
@@ -164,8 +162,6 @@ def _config(form: Form, root: Path, options: dict[str, Any]) -> DatasetConfig:
 
 @dataclass(frozen=True)
 class Opened:
-    """A set with its data."""
-
     form: str  # name of the form
     packs: tuple[Pack, ...]  # one per fold, which differ in the column split only
     tasks: tuple[tuple[SuiteTask, AnyTask], ...]  # what the suite asks, and the task as the data defines it

@@ -38,7 +38,6 @@ Scored = dict[str, dict[tuple[str, str], list[dict[str, Any]]]]  # source -> tas
 
 
 def shipped() -> list[str]:
-    """Names of the closed-loop suites of this version."""
     return sorted(path.stem for path in SUITES.glob("*.toml"))
 
 
@@ -168,7 +167,6 @@ def _cell(suite: Suite, known: Scored, source: str, key: tuple[str, str]) -> str
 
 
 def note(suite: Suite, values: Sequence[dict[str, Any]]) -> str:
-    """What stands beside the tables."""
     pins = [f"{v['encoder']['name']} {'same' if v['data'] == suite.pins else 'others'}" for v in values]
     return (
         f"{suite.note}. * differs from the untrained trunks: the 95 % interval of the difference, paired by shape or"

@@ -52,7 +52,6 @@ class Shape:
         return soft * np.logaddexp(y / soft, second / soft)  # a minimum (maximum, if hollow) with a round corner
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Height of the object without its texture."""
         if self.kind == "surface":
             return sum(h * np.sin(2 * math.pi * (u * x + v * y) + p) for h, u, v, p in self.waves)  # type: ignore[return-value]
         beyond, roll = np.maximum(-self.inside(x, y), 0), self.roll_mm
@@ -169,7 +168,6 @@ TASKS: dict[str, Any] = {"edge": Edge, "surface": Surface}
 
 
 def task_of(kind: str) -> Any:
-    """The task whose shapes include ``kind``."""
     return next(task for task in TASKS.values() if kind in task.kinds)
 
 

@@ -136,7 +136,6 @@ def find_plan(given: str) -> Plan:
 
 
 def slug(label: str) -> str:
-    """A label as a folder name."""
     return "-".join("".join(c if c.isalnum() or c in ".=" else " " for c in label.lower()).split())
 
 

@@ -144,11 +144,6 @@ class Encoders:
     vision: EncoderConfig = EncoderConfig()
     touch: EncoderConfig = EncoderConfig()
 
-    @classmethod
-    def both(cls, **fields: Any) -> "Encoders":
-        """The same network for both modalities. ``fields`` are those of ``EncoderConfig``."""
-        return cls(vision=EncoderConfig(**fields), touch=EncoderConfig(**fields))
-
     def __getitem__(self, modality: str) -> EncoderConfig:
         return self.vision if modality == "vision" else self.touch
 

@@ -24,8 +24,6 @@ RUNAWAY = 30.0  # a velocity (m/s or rad/s) that occurs only if the solver diver
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """The parameters of one grasp."""
-
     force_n: float  # limit of the grip force, per finger
     offset_m: tuple[float, float, float]  # of the grip in the object's frame, from the centre of its bounds
     yaw: float  # angle in radians between the object's long side and the pads

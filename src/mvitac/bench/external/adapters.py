@@ -77,8 +77,6 @@ class Preprocessing:
 
 @dataclass(frozen=True)
 class Loaded:
-    """What an adapter opened."""
-
     network: nn.Module  # images -> features [B, D]
     preprocessing: Preprocessing
     title: str  # its name in tables
@@ -115,8 +113,6 @@ class Adapter(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Timm(Adapter):
-    """A model of timm."""
-
     weights: str = "pretrained"
     """pretrained (timm downloads them), random, or a file."""
     pool: Literal["last", "stages"] = "last"
