@@ -154,9 +154,12 @@ def _twin(value: dict[str, Any]) -> None:
 
 
 def _copied(value: dict[str, Any]) -> None:
-    """What it does in one condition is said of the next, too."""
     first, second = value["rows"][0]["cells"][:2]
     second |= {key: first[key] for key in ("mm", "deg", "lost")}
+
+
+def _blind_late(value: dict[str, Any]) -> None:
+    next(row for row in value["rows"] if row["source"] == "no touch")["cells"][1]["mm"][0] += 0.1
 
 
 def _not_lost(value: dict[str, Any]) -> None:
@@ -181,6 +184,7 @@ CHANGES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "has the unknown field 'score'": put("rows", 0, "cells", 0, "score", value=1.0),
     "its sums are not of": lambda value: value["rows"][0]["cells"][0]["mm"].pop(),
     "the encoder, seed 5, .* has the sums of the encoder, seed 5": _copied,
+    "no touch, .* sees nothing, and does otherwise": _blind_late,
     "a sum is no number": put("rows", 0, "cells", 0, "mm", 0, value="1.0"),
     "untrained, seed 1, .* has the sums of untrained, seed 0": _twin,
     "weights for seeds": lambda value: value["encoder"]["weights"].append("0" * 64),

@@ -326,7 +326,9 @@ def test_a_run_that_diverges_is_told_and_the_rest_goes_on(pack: Pack, tmp_path: 
     assert "Diverged: wild, seed 0" in write_tables(result, tmp_path)[0].read_text()
     assert {record["source"] for record in result["records"]} == {"MViTac"}
     lost = replace(work, jobs=[job for job in work.jobs if job.label == "wild"])
-    with pytest.raises(ValueError, match=r"no run of .* is finished: .*\(wild, seed 0: the loss is not finite"):
+    with pytest.raises(
+        ValueError, match=r"no run of .* is finished with probes linear: .*; wild, seed 0: the loss is not"
+    ):
         gather(lost, tmp_path, ProbeConfig(controls=False))
 
 

@@ -62,8 +62,6 @@ class Form:
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteSet:
-    """A dataset, its tasks and its split."""
-
     name: str
     forms: tuple[Form, ...]
     """The first one that is found below --data-root is used. Scores of different forms are not compared."""

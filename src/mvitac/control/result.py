@@ -117,7 +117,7 @@ def _problems(value: dict[str, Any], suite: Suite) -> Iterator[str]:
             whole = (n == suite.scored).all() and np.isfinite(sums).all()
             if not whole or suite.impossible(cell["task"], n, np.array(sums)):
                 yield f"{who}, {cell['task']}, {cell['condition']}: no episodes give these sums"
-    told: dict[Any, str] = {}
+    told: dict[Any, Any] = {}
     free = suite.true, suite.blind  # which do not see what differs between conditions
     for row in sorted(value["rows"], key=lambda row: row["source"] not in free):
         for cell in row["cells"]:
@@ -126,6 +126,9 @@ def _problems(value: dict[str, Any], suite: Suite) -> Iterator[str]:
             same = told.setdefault(own, who) != who and row["source"] not in free
             if same and any(len({*cell[key]}) > 1 for key in suite.sums):  # not where all lose contact at once
                 yield f"{who} has the sums of {told[own]}"
+            key = row["source"], cell["task"], suite.lesson((cell["task"], cell["condition"]))
+            if row["source"] == suite.blind and told.setdefault(key, own) != own:
+                yield f"{who}: it sees nothing, and does otherwise than in another condition"
     true = next(row["cells"] for row in value["rows"] if row["source"] == suite.true)
     for cell, again in zip(true, score(suite, Row(suite.true, None, None)), strict=True):
         if not np.allclose(*([one[key] for key in suite.sums] for one in (cell, again)), rtol=1e-3, atol=1e-3):

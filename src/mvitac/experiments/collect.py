@@ -106,8 +106,8 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
     failed = {job.name: job.failure for job in work.jobs if job.failure}
     finished = [job for job in work.jobs if job.done and not job.failure]
     if not finished:
-        lost = "; ".join(f"{name}: {error}" for name, error in failed.items())
-        raise ValueError(f"no run of {out} is finished: nothing to show yet{f' ({lost})' if lost else ''}")
+        lost = "; ".join(["nothing to show yet", *(f"{name}: {error}" for name, error in failed.items())])
+        raise ValueError(f"no run of {out} is finished with probes {' '.join(session.probes)}: {lost}")
     scored = [_scores(job) for job in finished]
     controls, found = _controls(work, out, session)
     runs, labels = [load_run(job.out) for job in finished], dict.fromkeys(job.label for job in finished)

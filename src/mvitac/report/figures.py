@@ -190,7 +190,6 @@ def _print(figure: Figure, kind: str, metadata: dict[str, Any], **options: Any) 
 
 
 def to_png(figure: Figure) -> bytes:
-    """The figure as a PNG on white."""
     figure.set_dpi(dpi := 200)
     return _print(figure, "png", {"Software": None}, facecolor="white", dpi=dpi)
 

@@ -87,7 +87,6 @@ def load_start(start: Start, method: Method) -> dict[str, Any]:
 
 
 def describe(record: dict[str, Any]) -> str:
-    """One line about the record of ``load_start``."""
     parts = [f"{modality} {' and '.join(names)}" for modality, names in record["taken"].items()]
     parts += [f"not {modality} ({reason})" for modality, reason in record.get("not_taken", {}).items()]
     return f"starts from {record['name']} (sha256 {record['digest'][:12]}): {', '.join(parts)}"
