@@ -341,7 +341,6 @@ FEW, NO_VISION, NO_TOUCH = "30 % of labels", "the encoder has no vision", "the e
 
 
 def twins(value: dict[str, Any]) -> None:
-    """The better untrained trunk twice."""
     for records in (block.get("records", ()) for block in value["blocks"]):
         known = {
             (r["modality"], r["probe"]): r["sums"] for r in records if (r["source"], r["seed"]) == ("untrained", 0)

@@ -404,6 +404,8 @@ def test_an_output_that_is_an_input(refused: Callable[..., str], finished: Path,
     refused(f"predict e {table} --out {frame.with_name('look.png')}", "no trained model at e")
     pq.write_table(pa.table({"touch": ["../frames/3.png"]}), frame.with_name("t.parquet"))
     refused(f"data check {frame.with_name('t.parquet')} --sheet {frame}", "may be what the command reads")
+    frame.with_name("bad.parquet").write_bytes(b"0")
+    refused(f"data info {frame.with_name('bad.parquet')} --json {finished}/run.json", "no pack at")
     times, log = frame.with_name("press_timestamps.csv"), frame.with_name("press_force.csv")
     for name in (times, log):
         name.touch()

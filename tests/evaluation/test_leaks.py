@@ -217,7 +217,6 @@ def test_the_same_images_under_other_names_leak(pack: Pack, tmp_path: Path, kept
 
 
 def test_the_image_of_one_of_two_gels_is_a_leak(tmp_path: Path) -> None:
-    """Alone in either place, also in windows, which begin with the newest frame."""
     rng = np.random.default_rng(0)
     left, right, other = (rng.integers(0, 255, (4, 32, 32, 3), dtype=np.uint8) for _ in range(3))
     packs = {}

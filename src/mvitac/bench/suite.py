@@ -32,8 +32,6 @@ Pinned = Literal["same", "other pixels", "other rows", "not pinned"]
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteTask:
-    """A task of a set."""
-
     name: str  # its name in the data
     modalities: tuple[Literal["touch", "vision", "both"], ...]  # features to probe
     labels: tuple[float, ...] = ()  # fractions of the labels with which the linear probe is fitted once more

@@ -9,6 +9,7 @@ import re
 import shlex
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -161,13 +162,14 @@ def _names(place: Path) -> str:
     place = place / "run.json" if (place / "run.json").is_file() else place
     if place.suffix in (".csv", ".jsonl", ".json") and place.is_file():
         return place.read_text(errors="replace")
-    if place.suffix != ".parquet" or not place.is_file():
-        return ""
-    import pyarrow.parquet as pq
+    if place.suffix == ".parquet" and place.is_file():
+        import pyarrow.parquet as pq
 
-    schema = pq.read_schema(place)
-    texts = pq.read_table(place, columns=[field.name for field in schema if str(field.type) == "string"])
-    return f"{texts.to_pydict()} {(schema.metadata or {}).values()}"
+        with suppress(ValueError, OSError):  # a damaged file, of which the command itself says so
+            schema = pq.read_schema(place)
+            texts = pq.read_table(place, columns=[field.name for field in schema if str(field.type) == "string"])
+            return f"{texts.to_pydict()} {(schema.metadata or {}).values()}"
+    return ""
 
 
 def help_file(command: str) -> Path:
