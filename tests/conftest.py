@@ -88,7 +88,6 @@ def smoke_run(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def artifact(smoke_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """That run, published."""
     from mvitac.deploy.publish import publish
 
     return publish(smoke_run, tmp_path_factory.mktemp("artifact") / "artifact")
@@ -96,7 +95,6 @@ def artifact(smoke_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def copy(artifact: Path, tmp_path: Path) -> Path:
-    """That artifact, to be changed."""
     return shutil.copytree(artifact, tmp_path / "artifact")
 
 
@@ -114,7 +112,6 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 
 @pytest.fixture(scope="session")
 def onnx(artifact: Path, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """That artifact, exported."""
     from mvitac.deploy.artifact import load
     from mvitac.deploy.export import export
 
@@ -145,7 +142,6 @@ def value_artifact(measured: Pack, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture(scope="session")
 def value_onnx(value_artifact: Path, measured: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """That artifact, exported."""
     from mvitac.deploy.artifact import load
     from mvitac.deploy.export import export
 

@@ -177,7 +177,6 @@ class Run:
 
     @property
     def bf16(self) -> bool:
-        """Whether the networks compute in bf16."""
         assert self.precision != "auto", "auto is resolved earlier (system.device.Hardware)"
         return self.precision == "bf16"
 

@@ -39,7 +39,6 @@ ROWS = np.arange(6)
 
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
-    """A file with the weights of a timm model."""
     network = timm.create_model("test_resnet", num_classes=0)
     torch.save(network.state_dict(), tmp_path / "trunk.pth")
     return tmp_path / "trunk.pth"

@@ -50,7 +50,6 @@ class WorkBegan(AssertionError):
 
 @pytest.fixture(scope="module")
 def finished(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A good run of two steps."""
     run = replace(recipe("smoke", PackConfig(path=pack.path, size=pack.size)), steps=2, eval_every=0)
     return train(run, tmp_path_factory.mktemp("finished") / "run", quiet=True)
 
@@ -137,6 +136,8 @@ WORDS: list[tuple[str, str, str]] = [
     ("bench {run} ", "--suite servo-v2", "did you mean 'servo-v1'"),
     ("bench {run} ", "--suite servo-v1 --data-root {tmp}", "--data-root has no effect on servo-v1"),
     ("predict {run} ", "--background {tmp}/a.png --calibration 9 --touch sim --out {out}", "give a video (.mp4"),
+    ("compare ", "--data pack --data.path {pack} --dry-run --tables-only --out {out}", "no effect beside --dry-run"),
+    ("data pack --data rosbag --path {tmp} --out {out} ", "--allow-missing", "fixed argument"),
     (PRETRAIN, "--data.frames-of both", "--data.frames-of is for rows of several frames"),
     (PRETRAIN, "--data.order press --data.minus-first --data.stride 2", "--data.stride is for rows of several frames"),
     ("probe {run} ", "{run}", "twice"),
@@ -400,8 +401,9 @@ def test_an_output_that_is_an_input(refused: Callable[..., str], finished: Path,
         refused(f"predict e {finished}/{source} --out {frame}", "may be what the command reads")
     (table := frame.with_name("t.csv")).write_text("touch\nframes/3.png\n")
     refused(f"predict e {table} --out {frame}", "may be what the command reads")
-    (frame.with_name("look.png")).touch()  # beside a table, that of last time
-    refused(f"predict e {table} --out {frame.with_name('look.png')}", "no trained model at e")
+    for name in ("look.png", "png"):  # beside a table, that of last time
+        frame.with_name(name).touch()
+        refused(f"predict e {table} --out {frame.with_name(name)}", "no trained model at e")
     pq.write_table(pa.table({"touch": ["../frames/3.png"]}), frame.with_name("t.parquet"))
     refused(f"data check {frame.with_name('t.parquet')} --sheet {frame}", "may be what the command reads")
     frame.with_name("bad.parquet").write_bytes(b"0")

@@ -205,6 +205,14 @@ def test_changed_results_are_refused(done: Path, tmp_path: Path, why: str) -> No
         result.read_control(path)
 
 
+def test_constant_features_are_no_copies(done: Path, tmp_path: Path) -> None:
+    value = json.loads(done.read_text())
+    value["rows"][0]["cells"] = next(row["cells"] for row in value["rows"] if row["source"] == "no touch")
+    value["digest"] = digest({key: part for key, part in value.items() if key not in VOLATILE})
+    (path := tmp_path / "constant.json").write_text(json.dumps(value))
+    assert result.read_control(path)[1] == value
+
+
 def measured(name: str, *rows: tuple[str, int | None, float]) -> dict[str, Any]:
     """A result of eight straight edges; ``rows``: source, seed and mm."""
     cell = {"task": "straight", "condition": "late", "n": [4.0] * 8, "deg": [0.0] * 8, "lost": [0.0] * 8}

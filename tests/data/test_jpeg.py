@@ -38,7 +38,6 @@ def jpeg_pack(path: Path, source: Source | None = None, **options: Any) -> Pack:
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Pack:
-    """The toy's 120 pairs as JPEG."""
     return jpeg_pack(tmp_path_factory.mktemp("jpeg") / "pack")
 
 

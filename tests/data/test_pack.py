@@ -251,7 +251,6 @@ def test_damaged_items_stop_or_are_listed(tmp_path: Path) -> None:
 
 
 def check_images(pack: Pack, items: list[int]) -> None:
-    """Every row's images, against the toy's ``items``."""
     samples = [Toy().read(item)[0] for item in items]
     assert pack.column("id").tolist() == [sample.columns["id"] for sample in samples]
     for modality in ("vision", "touch"):

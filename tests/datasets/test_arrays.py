@@ -454,7 +454,6 @@ def test_what_zarr_says_is_not_believed(tmp_path: Path, name: str, capsys: pytes
 
 
 def shaped(shape: tuple[int, ...], kind: str) -> bytes:
-    """A .npy file without its numbers."""
     file = io.BytesIO()
     np.lib.format.write_array_header_1_0(file, {"descr": kind, "fortran_order": False, "shape": shape})
     return file.getvalue()

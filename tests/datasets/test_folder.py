@@ -151,7 +151,6 @@ def test_the_cache_knows_changed_files_of_the_same_size(tmp_path: Path) -> None:
 
 
 def seen_while_packing(options: FolderConfig, out: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Items that are read."""
     seen: list[int] = []
     read = Rows.read
     with monkeypatch.context() as patch:

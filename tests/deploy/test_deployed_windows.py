@@ -31,7 +31,6 @@ from support.toy import film
 
 @pytest.fixture(scope="module")
 def published(measured: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A model of the two newest frames of touch."""
     folder = tmp_path_factory.mktemp("windows")
     run = replace(recipe("smoke", PackConfig(path=measured.path, num_frames=2)), steps=2, eval_every=0)
     return publish(train(run, folder / "run", quiet=True), folder / "artifact")

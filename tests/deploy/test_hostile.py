@@ -111,7 +111,6 @@ PLACES: list[tuple[str, Change]] = [
 
 @pytest.fixture
 def trap(tmp_path: Path) -> Path:
-    """A folder of somebody's files."""
     folder = tmp_path / "trap"
     (folder / "process-0").mkdir(parents=True)
     (folder / "process-1").mkdir()

@@ -14,7 +14,7 @@ from sklearn.preprocessing import StandardScaler
 from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack
 from mvitac.data.spec import Target
-from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.evaluate import ProbeConfig, chosen, probe_runs
 from mvitac.evaluation.intervals import interval, paired_difference
 from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.regressors import fit_curve, fit_ridge
@@ -155,6 +155,11 @@ def test_probes_of_classes_and_values_side_by_side(measured: Pack, tmp_path: Pat
     assert ("pattern", "mvitac", "touch", "paper") in found and ("pattern", "mean", "none", "linear") not in found
     shown = result["summary"]["light"]["touch"]["mvitac"]["mean"]
     assert shown == pytest.approx(found["light", "mvitac", "touch", "linear"]["r2"])
+
+
+def test_the_papers_probe_alone_is_refused_for_values(measured: Pack) -> None:
+    with pytest.raises(ValueError, match="probe paper is for classes, these are values: give linear or knn"):
+        chosen(measured, ProbeConfig(probes=("paper",), tasks=("light",)))
 
 
 def test_packs_with_other_units_cannot_be_joined(measured: Pack) -> None:

@@ -47,7 +47,6 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 @pytest.fixture(scope="module")
 def done(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
-    """Six runs, straight through, and their result."""
     out = tmp_path_factory.mktemp("compare") / "out"
     work = lay_out(small(pack), pack, out, ProbeConfig())
     do_all(work, quiet=True)

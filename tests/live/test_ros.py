@@ -30,7 +30,6 @@ def load_node() -> Any:
 
 
 def carried(message: Any) -> Any:
-    """The message after it went through ROS."""
     kind = message.__msgtype__
     if not isinstance(message.data, str):
         message = replace(message, data=np.frombuffer(message.data, np.uint8))

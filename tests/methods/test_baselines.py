@@ -35,7 +35,6 @@ from support.training_runs import smoke
 
 
 def unit(x: torch.Tensor) -> list[list[float]]:
-    """Rows of ``x`` L2-normalised, as plain numbers."""
     return [[v / math.hypot(*row) for v in row] for row in x.tolist()]
 
 
@@ -171,7 +170,6 @@ def test_mct_crosses_modalities_through_the_inter_heads() -> None:
 
 
 def distance(p: torch.Tensor, t: torch.Tensor) -> float:
-    """The mean squared distance of unit vectors."""
     rows = zip(unit(p), unit(t), strict=True)
     return sum(sum((x - y) ** 2 for x, y in zip(a, b, strict=True)) for a, b in rows) / len(p)
 

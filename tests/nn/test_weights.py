@@ -94,7 +94,6 @@ OUTSIDE = {"queue": torch.zeros(2), "module.encoder_k.conv1.weight": torch.zeros
 
 @pytest.fixture(scope="module")
 def state() -> State:
-    """Weights with a classifier, as timm has them."""
     torch.manual_seed(5)
     return timm.create_model(NAME).state_dict()
 

@@ -14,7 +14,6 @@ SIZE = 40
 
 
 def digest(rows: list[dict]) -> str:
-    """Hash pictures and numbers of a grasp."""
     state = hashlib.sha256()
     for row in rows:
         for key in sorted(row):
@@ -28,7 +27,6 @@ def thing(name: str = "box") -> objects.Thing:
 
 
 def plan(**change) -> physics.Plan:
-    """A centred, level, firm grip."""
     firm = physics.Plan(force_n=6.0, offset_m=(0.0, 0.0, 0.0), yaw=0.0, lift_m=0.05, friction=0.6)
     return dataclasses.replace(firm, **change)
 

@@ -28,7 +28,6 @@ def digest(pair: dict) -> str:
 
 
 def bumps(seed: int = 0) -> np.ndarray:
-    """A relief [48, 64] mm with holes in it."""
     relief = np.random.default_rng(seed).normal(0, 0.2, (48, 64)).astype(np.float32)
     relief[:, :5] = -np.inf
     return relief

@@ -34,7 +34,6 @@ class Clock:
 
 
 def touching(t: float) -> bool:
-    """One second free, two in contact."""
     return t % 3 >= 1
 
 
@@ -95,7 +94,6 @@ class World:
 
 
 def resident() -> int:
-    """Bytes of this process in memory (Linux)."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 

@@ -40,7 +40,6 @@ def seal(path: Path) -> None:
 
 
 def described(*keys: str, value: Any) -> Spoil:
-    """pack.json with another value, consistently sealed."""
 
     def spoil(path: Path) -> None:
         edited(path / "pack.json", keys, value)

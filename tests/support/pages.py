@@ -5,5 +5,4 @@ from base64 import b64decode
 
 
 def drawings(page: str) -> list[str]:
-    """The figures of ``page`` as SVG."""
     return [b64decode(found).decode() for found in re.findall(r'src="data:image/svg\+xml;base64,([^"]*)"', page)]

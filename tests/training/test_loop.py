@@ -270,7 +270,6 @@ def test_learning_rate_schedules() -> None:
 
 @pytest.fixture(scope="module")
 def twice(tmp_path_factory: pytest.TempPathFactory) -> Pack:
-    """Simulated presses, each through two sensors."""
     config = MaterialsConfig(num=40, touches=2, sensors_per_press=2, size=16)
     return build(config.source(), tmp_path_factory.mktemp("twice") / "p", size=16, quiet=True)
 

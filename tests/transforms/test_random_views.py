@@ -11,7 +11,6 @@ from mvitac.transforms.random_views import IMAGENET, Drawn, ViewAugment, draw, p
 
 
 def images(num: int = 8, channels: int = 3, side: int = 40) -> torch.Tensor:
-    """Smooth uint8 pictures, as photographs are."""
     noise = torch.rand(num, channels, 6, 6, generator=torch.Generator().manual_seed(3))
     return (F.interpolate(noise, (side, side), mode="bicubic").clamp(0, 1) * 255).to(torch.uint8)
 

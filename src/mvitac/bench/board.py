@@ -53,6 +53,7 @@ class Board:
     results: dict[str, dict[str, Any]]
     rows: list[Row]
     not_run: list[str]
+    differ: list[str]  # a line for each control that is not the same in all results
 
     @property
     def controls(self) -> list[str]:
@@ -96,6 +97,7 @@ def gather(results: dict[str, dict[str, Any]]) -> Board:
     suite = suite_of(next(iter(results.values())))
     rows: list[Row] = []
     not_run: list[str] = []
+    differ: list[str] = []
     for number, (one, ask) in enumerate((each, ask) for each in suite.sets for ask in each.tasks):
         forms: dict[tuple[str, str], list[tuple[str, dict[str, Any]]]] = {}
         for name, result in results.items():
@@ -121,11 +123,11 @@ def gather(results: dict[str, dict[str, Any]]) -> Board:
             for name, block in found:
                 if others := {k[0] for r in block["records"] if known.get(k := _key(r), r["sums"]) != r["sums"]}:
                     text = f"{task}: {', '.join(sorted(others))} of the result of {name} differ from those shown"
-                    not_run.append(f"{text}: made on another machine, or edited")
+                    differ.append(f"{text}. It was made on another machine, or edited.")
                 mine = records_of(block, results[name]["encoder"])
                 records += [r for r in mine if r["source"] == name or block is shown]
             rows += _rows(task, found[0][1]["group_by"], records, suite.probes[0], ask)
-    return Board(results, rows, not_run)
+    return Board(results, rows, not_run, differ)
 
 
 def _key(record: dict[str, Any]) -> tuple[Any, ...]:
@@ -212,7 +214,8 @@ def _scores(board: Board) -> list[Markup]:
         for t, target in enumerate(next(filter(None, cells)).get("targets", ())):
             what = f"{row.task}, {row.modality}: {target['name']} ({target['unit']})"
             errors.append([what, *(f"{c['targets'][t]['mae']:.3g}" if c else "" for c in cells)])
-    found = [page.paragraph(" ".join(SCORES.split())), page.table(["", *columns], rows, label="scores")]
+    intro = [page.paragraph(text) for text in (" ".join(SCORES.split()), *board.differ)]
+    found = [*intro, page.table(["", *columns], rows, label="scores")]
     table = page.table(["", *columns], errors, label="errors")
     return [*found, page.fold("Mean absolute errors in their units", table)] if errors else found
 

@@ -138,9 +138,7 @@ def _check_outputs(words: Sequence[str]) -> None:
     outputs = {i + 1: word for i, word in enumerate(places[:-1]) if word in ("--out", "--json", "--sheet", "--record")}
     others = [re.sub(r"(@[\d.]+)?(#.*)?$", "", place) for i, place in enumerate(places) if i not in outputs]
     parts = [*others, *(part for place in others for part in re.split("[,:]", place))]
-    beside = [
-        Path(part).name.replace("{}", "*") if "{}" in part else f"{Path(part).stem}_timestamps.*" for part in parts
-    ]
+    beside = [Path(p).name.replace("{}", "*") if "{}" in p else f"{Path(p).stem}_timestamps.*" for p in parts]
     seen: set[Path] = set()
     for i, option in outputs.items():
         file = Path(os.path.realpath(places[i]))
@@ -149,11 +147,12 @@ def _check_outputs(words: Sequence[str]) -> None:
         seen.add(file)
         if not file.is_file():
             continue
+        name = rf"(?<![\w.-]){re.escape(file.name)}(?![\w.-])"
         texts = [_names(Path(part)) for part in parts]
         named = [Path(name) for text in texts for name in re.findall(r'"(?:path|pack)": "([^"]+)"', text)]
         inputs = [Path(os.path.realpath(place)) for place in (*parts, *named) if os.path.exists(place)]
         read = {file, *file.parents} & {*inputs} or any(os.path.samefile(file, place) for place in inputs)
-        if read or any(file.name in text for text in texts) or any(fnmatch(file.name, each) for each in beside):
+        if read or any(re.search(name, text) for text in texts) or any(fnmatch(file.name, each) for each in beside):
             raise ValueError(f"{option} {places[i]} may be what the command reads: choose another place")
 
 

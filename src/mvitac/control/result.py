@@ -119,12 +119,17 @@ def _problems(value: dict[str, Any], suite: Suite) -> Iterator[str]:
                 yield f"{who}, {cell['task']}, {cell['condition']}: no episodes give these sums"
     told: dict[Any, Any] = {}
     free = suite.true, suite.blind  # which do not see what differs between conditions
+    nothing = {
+        c["task"]: c[suite.sums[0]] for row in value["rows"] if row["source"] == suite.blind for c in row["cells"]
+    }
     for row in sorted(value["rows"], key=lambda row: row["source"] not in free):
         for cell in row["cells"]:
             who = f"{row['source'] or 'the encoder'}, seed {row['seed']}, {cell['task']}, {cell['condition']}"
             own = cell["task"], *(tuple(cell[key]) for key in suite.sums)
             same = told.setdefault(own, who) != who and row["source"] not in free
-            if same and any(len({*cell[key]}) > 1 for key in suite.sums):  # not where all lose contact at once
+            # Not where all lose contact at once, nor of an encoder whose features are constant: it does as without senses.
+            knows = not np.allclose(cell[suite.sums[0]], nothing.get(cell["task"], np.nan))
+            if same and knows and any(len({*cell[key]}) > 1 for key in suite.sums):
                 yield f"{who} has the sums of {told[own]}"
             key = row["source"], cell["task"], suite.lesson((cell["task"], cell["condition"]))
             if row["source"] == suite.blind and told.setdefault(key, own) != own:

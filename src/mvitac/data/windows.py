@@ -68,12 +68,12 @@ class Windows(Lazy):
         return found.transpose(0, 2, 3, 1, 4).reshape(num, height, width, frames * channels)
 
 
-def recordings(pack: Pack, place: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the rows of each touch in the order of ``place`` [N]; ValueError if two have the same."""
+def recordings(pack: Pack, place: np.ndarray, *, distinct: bool = True) -> Iterator[np.ndarray]:
+    """Yield the rows of each touch in the order of ``place`` [N]; if ``distinct``, ValueError where two have the same."""
     for group in range(int(pack.touch_groups.max()) + 1):
         rows = pack.rows_of(group)
         rows = rows[np.argsort(place[rows], kind="stable")]
-        if (same := np.diff(place[rows]) == 0).any():
+        if distinct and (same := np.diff(place[rows]) == 0).any():
             two = f"two rows of touch {_touch(pack, rows)!r} are at {place[rows[int(np.flatnonzero(same)[0])]]:g}"
             raise ValueError(f"{two}: pack with --touch-group RECORDING, or name another --data.order")
         yield rows
@@ -115,9 +115,7 @@ def places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
     place = np.array([_number(cell) for cell in pack.column(name)])
     if not np.isfinite(place).all():
         row = int(np.flatnonzero(~np.isfinite(place))[0])
-        raise ValueError(
-            f"{pack.path}: column {name!r} is not a number in row {row}: give all rows one, or another order"
-        )
+        raise ValueError(f"{pack.path}: column {name!r} is not a number in row {row}: give all rows one")
     return name, place
 
 

@@ -214,7 +214,6 @@ def _numbers(root: Path, rows: Sequence[Row], name: str) -> np.ndarray:
 
 
 def _tasks(root: Path, info: dict[str, Any]) -> dict[str, str]:
-    """Return the text of each task_index."""
     file = root / "meta" / ("tasks.parquet" if _is_new(info) else "tasks.jsonl")
     with fields_of(file):
         pairs = [(str(row.pop("task_index")), row.popitem()[1]) for row in (_rows(file) if file.is_file() else [])]

@@ -92,9 +92,7 @@ class Embeddings:
         x = model.embed(**{source: images}, background=background, shared=self.shared)[source]
         bank = self.banks[target]
         if not np.isfinite(bank).any() or bank.shape[1] != x.shape[1]:
-            raise ValueError(
-                f"{self.file} has no {target} vectors of {x.shape[1]} numbers: embed data that has {target}"
-            )
+            raise ValueError(f"{self.file} has no {target} vectors of {x.shape[1]} numbers: embed data that has it")
         return nearest(bank, unit(x.cpu().numpy()), k)
 
     def labels(self, row: int) -> dict[str, str]:

@@ -252,9 +252,8 @@ def recording(text: str) -> Recording:
     text, crop = crop_of(text)
     path, fps = _place(text)
     if not (path.is_dir() or path.suffix.lower() in VIDEOS):
-        raise ValueError(
-            f"source {text!r}: give a video ({', '.join(VIDEOS)}) or a folder[@fps]; live: a camera or sim"
-        )
+        known = f"a video ({', '.join(VIDEOS)}) or a folder[@fps]"
+        raise ValueError(f"source {text!r}: give {known}; mvitac live also takes a camera or sim")
     files = Folder(path, fps) if path.is_dir() else Video(path)
     files.crop = crop
     try:  # now: unlike a camera, a missing file does not come back

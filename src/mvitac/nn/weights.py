@@ -218,6 +218,5 @@ def misfit(expected: State, found: dict[str, Any]) -> str:
 
 
 def _some(names: Collection[str]) -> str:
-    """How many, and the first ones."""
     first = ", ".join([*names][:3]) + ", ..." * (len(names) > 3)
     return f"{len(names)} tensor{'s' * (len(names) > 1)} ({first})"

@@ -173,7 +173,6 @@ KINDS = tuple(_DRAW)  # shape kinds. Objects cycle through them, so that every s
 
 
 def make_thing(seed: int, index: int) -> Thing:
-    """Draw object ``index`` of data seed ``seed``."""
     rng, kind = np.random.default_rng([OBJECT_TAG, seed, index]), KINDS[index % len(KINDS)]
     parts = _DRAW[kind](rng)
     return Thing(

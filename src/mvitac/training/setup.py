@@ -42,8 +42,6 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Setup:
-    """What the training loop works with."""
-
     run: Run  # with ``precision`` resolved for this machine
     pack: Pack
     rows: np.ndarray  # pack rows to train on

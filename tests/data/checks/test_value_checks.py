@@ -90,6 +90,12 @@ def test_each_fault_is_found_and_no_other(tmp_path: Path, fault: str, item: str,
     assert ";" not in found[item].advice  # one thing to do
 
 
+def test_two_recordings_in_one_touch_hide_no_stuck_sensor_of_another(tmp_path: Path) -> None:
+    pack = packed(tmp_path / "pack", "stuck")
+    together = ["0" if name == "1" else name for name in pack.column("touch_group")]
+    assert "1 constant stretches" in value_checks.values(with_columns(pack, touch_group=together))[0].evidence
+
+
 def test_missing_values(tmp_path: Path) -> None:
     (force, _) = value_checks.values(packed(tmp_path / "a", "missing"))
     assert force.verdict == "ok" and "160 of 640 (25.0 %) rows of train, val and test have none" in force.evidence

@@ -54,7 +54,7 @@ Note = tuple[str, list[int]]  # what is wrong ("" = nothing), and the rows to lo
 def _touches(pack: Pack) -> list[np.ndarray]:
     """Rows of each touch in the order of time; empty if no column orders them."""
     try:
-        return [*recordings(pack, places(pack, Window())[1])]
+        return [*recordings(pack, places(pack, Window())[1], distinct=False)]
     except ValueError:
         return []
 

@@ -158,7 +158,6 @@ class RowsConfig(DatasetConfig, ABC):
         return looks
 
     def conditioned(self) -> list[str]:
-        """Return the columns that the conditions name."""
         return [Condition.parse(text).column for text in (*self.only, *self.label_only, *self.no_contact)]
 
     def vectors(self) -> set[str]:
