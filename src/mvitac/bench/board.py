@@ -123,7 +123,7 @@ def gather(results: dict[str, dict[str, Any]]) -> Board:
             for name, block in found:
                 if others := {k[0] for r in block["records"] if known.get(k := _key(r), r["sums"]) != r["sums"]}:
                     text = f"{task}: {', '.join(sorted(others))} of the result of {name} differ from those shown"
-                    differ.append(f"{text}. It was made on another machine, or edited.")
+                    differ.append(f"{text}: that result was made on another machine, or edited.")
                 mine = records_of(block, results[name]["encoder"])
                 records += [r for r in mine if r["source"] == name or block is shown]
             rows += _rows(task, found[0][1]["group_by"], records, suite.probes[0], ask)
