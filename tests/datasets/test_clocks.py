@@ -244,6 +244,10 @@ def test_a_table_of_videos_takes_the_times_beside_them_and_elements_of_lists_fro
     pack = packed(tmp_path / "m.csv", tmp_path / "p", **options)
     expected = force(0.08 * pack.column("frame").astype(int))
     assert np.allclose(pack.values(pack.spec.values[0])[:, 0], expected, atol=1e-6)
+    with (tmp_path / "2/force.jsonl").open("a") as log:
+        log.write('\n{"stamp": 5.01, "wrench": []}\n{"stamp": 5.02, "wrench": [0]}')
+    with pytest.raises(ValueError, match=r"2/force.jsonl row 602: wrench\[1\] does not exist: wrench has 1 numbers"):
+        FolderConfig(path=tmp_path / "m.csv", size=16, **options).source()
 
 
 def test_videos_without_labels_are_data(tmp_path: Path) -> None:

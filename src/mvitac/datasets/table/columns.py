@@ -79,8 +79,10 @@ def with_elements(table: Manifest, names: Iterable[str]) -> Manifest:
         if name in table.columns or vector not in table.columns:
             continue
         cells = [[part.strip() for part in row[vector].strip("[]()").split(",")] for row in rows]
-        if number >= (longest := max(map(len, cells))):
-            raise ValueError(f"{table.path}: {name} does not exist: {vector} has {longest} numbers, counted from 0")
+        for i, cell in enumerate(cells):
+            if number >= len(cell) and text_of(cell[0]) not in ("", "None"):
+                has = f"{vector} has {len(cell)} numbers, counted from 0"
+                raise ValueError(f"{table.at(i)}: {name} does not exist: {has}")
         texts = (cell[number] if number < len(cell) else "" for cell in cells)
         found = ["" if text == "None" else text_of(text) for text in texts]
         rows = [{**row, name: text} for row, text in zip(rows, found, strict=True)]
