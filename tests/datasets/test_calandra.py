@@ -151,6 +151,54 @@ def test_damaged_grasps_are_listed_and_the_rest_is_read(tmp_path: Path) -> None:
     assert [name[-2:] for name in reasons] == ["i1", "i2", "i3", "i4", "i8", "i9"]
 
 
+IMAGES: dict[str, tuple[Any, str]] = {
+    "a link": (h5py.SoftLink("/data/i2/gelsightA_during"), "data/i1/gelsightA_during is a link"),
+    "a link to another file": (h5py.ExternalLink("other.h5", "/x"), "data/i1/gelsightA_during is a link"),
+    "other bytes": (np.full(GEL, -5, np.int8), "it is int8 .*, not uint8"),
+    "text": ("gel", "it is object .*, not uint8"),
+    "nothing": (h5py.Empty("u1"), "it is uint8 None, not uint8"),
+    "no pixels but a group": ({}, "it is None None, not uint8"),
+    "external": ({"external": [("raw.bin", 0, 12288)]}, "shows the content of other files"),
+    "billions of pixels": ({"shape": (99_999, 99_999, 3), "chunks": (999, 999, 3)}, "9,999,800,001 pixels: at most"),
+}
+
+
+@pytest.mark.parametrize("kind", IMAGES)
+def test_an_image_is_what_it_should_be_and_in_its_own_file(kind: str, tmp_path: Path) -> None:
+    value, says = IMAGES[kind]
+    with h5py.File(write_shard(tmp_path, 0, [b"lemon"] * 3), "a") as file:
+        grasp: Any = file["data/i1"]
+        del grasp["gelsightA_during"]
+        if isinstance(value, dict) and value:
+            grasp.create_dataset("gelsightA_during", **{"shape": GEL, "dtype": "u1", **value})
+        elif isinstance(value, dict):
+            grasp.create_group("gelsightA_during")
+        else:
+            grasp["gelsightA_during"] = value
+    source = CalandraConfig(path=tmp_path, split="object").source()
+    with pytest.raises(ValueError, match=f"data/i1/gelsightA_during cannot be read .*{says}"):
+        source.read(1)
+
+
+@pytest.mark.parametrize("outcome", [np.nan, "False", -1, 2, h5py.Empty("f")])
+def test_an_outcome_is_a_bool(outcome: Any, tmp_path: Path) -> None:
+    """It was a success, whatever it was."""
+    write_shard(tmp_path, 0, [b"lemon"], grip=outcome)
+    with pytest.raises(ValueError, match="holds no grasp that can be read"):
+        CalandraConfig(path=tmp_path, split="object").source()
+
+
+def test_a_grasp_or_a_shard_that_is_no_file_of_this_folder(tmp_path: Path) -> None:
+    with h5py.File(write_shard(tmp_path, 0, [b"lemon", b"lime"]), "a") as file:
+        del file["data/i1"]
+        file["data/i1"] = h5py.ExternalLink("other.h5", "/x")
+    with pytest.raises(ValueError, match="data/i1 is a link"):
+        CalandraConfig(path=tmp_path).source().read(1)
+    os.mkfifo(tmp_path / "calandra_corl2017_001.h5")
+    with pytest.raises(ValueError, match=r"_001\.h5 cannot be read .*neither a file nor a folder"):
+        CalandraConfig(path=tmp_path).source()
+
+
 def test_a_truncated_shard_is_named(folder: Path, tmp_path: Path) -> None:
     path = Path(shutil.copytree(folder, tmp_path / "d")) / "calandra_corl2017_000.h5"
     path.write_bytes(path.read_bytes()[:-2000])

@@ -200,6 +200,13 @@ def test_the_background_follows_a_drifting_lamp() -> None:
     assert contact((image + 20).astype(np.uint8))
 
 
+def test_a_given_background_stays_however_slow_the_press() -> None:
+    contact = Contact(LiveConfig(), 32, free=np.full((32, 32, 3), 100, np.uint8))
+    for i in range(2000):
+        touched = contact((100 + i * 0.02 + np.random.default_rng(i).normal(0, 1, (32, 32, 3))).astype(np.uint8))
+    assert touched and contact.picture is not None and (contact.picture == 100).all()
+
+
 def test_what_is_simulated_is_asked_for() -> None:
     """All of it, where no source is given; else a forgotten camera would pass for a real one."""
     pair, gripper = {"vision": (32, 32, 3), "touch": (32, 32, 3)}, {"touch": (32, 32, 6)}

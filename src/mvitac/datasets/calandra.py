@@ -18,16 +18,18 @@ import random
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from mvitac.data.images import MAX_PIXELS
 from mvitac.data.source import Sample, Source, one_stamp, stamp_of
 from mvitac.data.spec import PHASES, DataSpec, Task
 from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.registry import check_known, check_range, to_json
-from mvitac.system.files import brief, digest
+from mvitac.system.files import brief, check_ordinary, digest
 
 VERSION = 1  # version of this reader. Increase it when the same shards would give another pack.
 Phase = Literal["before", "during", "after"]
@@ -69,7 +71,7 @@ REPAIRS = {
 
 def repaired(name: bytes | str) -> str:
     """Return the name in an attribute object_name, repaired."""
-    text = (name.decode() if isinstance(name, bytes) else name).strip(" \0\n\r\t")
+    text = (name.decode() if isinstance(name, bytes) else str(name)).strip(" \0\n\r\t")
     if not text:
         raise ValueError("object_name is empty")
     return REPAIRS.get(text, text)
@@ -184,6 +186,8 @@ class Calandra(Source):
             for phase in (phase for phase in PHASES if phase in self.config.phases):
                 names = (f"data/i{grasp.index}/{name}_{phase}" for name in ("gelsightA", "gelsightB", "kinectA_rgb"))
                 left, right, vision = (_image(file, name) for name in names)
+                if left.shape != right.shape:
+                    raise ValueError(f"the gels of {phase} are of {left.shape[:2]} and {right.shape[:2]} pixels")
                 labelled = {phase, "authors"} if phase == "during" or split == "train" else {phase}
                 columns = {
                     "id": f"{where}-{phase}",
@@ -208,27 +212,46 @@ def list_grasps(file: Path) -> list[Grasp]:
     import h5py
 
     try:
+        check_ordinary(file)  # a pipe never ends
         with h5py.File(file) as opened:
-            data: Any = opened["data"]
-            indices = sorted(int(name[1:]) for name in data if re.fullmatch(r"i\d+", name))
-            return [_describe(data, Grasp(file, int(file.stem[-3:]), index)) for index in indices]
-    except (OSError, KeyError, RuntimeError, TypeError) as error:  # h5py raises these for damaged files
+            indices = sorted(int(name[1:]) for name in _within(opened, "data") if re.fullmatch(r"i\d+", name))
+            return [_describe(opened, Grasp(file, int(file.stem[-3:]), index)) for index in indices]
+    except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:  # h5py raises these for damaged files
         raise ValueError(f"{file} cannot be read ({brief(error)}): download it again, or remove it") from None
 
 
-def _describe(data: Any, grasp: Grasp) -> Grasp:
+def _describe(file: Any, grasp: Grasp) -> Grasp:
     try:
-        attributes = data[f"i{grasp.index}"].attrs
+        attributes = _within(file, f"data/i{grasp.index}").attrs
         name, gripping = (np.asarray(attributes[key]).item() for key in ("object_name", "is_gripping"))
+        if gripping not in (0, 1):
+            raise ValueError(f"is_gripping is {gripping!r}, not a bool")
         return replace(grasp, object=repaired(name), gripping=bool(gripping))
     except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
         return replace(grasp, damage=f"attributes cannot be read ({brief(error)})")
 
 
+def _within(file: Any, name: str) -> Any:
+    """What is called ``name``; ValueError if it is a link, which may lead to another grasp, or into another file."""
+    import h5py
+
+    for path in accumulate(name.split("/"), "{}/{}".format):
+        if isinstance(file.get(path, getlink=True), (h5py.SoftLink, h5py.ExternalLink)):
+            raise ValueError(f"{path} is a link: copy what it shows into the file")
+    return file[name]
+
+
 def _image(file: Any, name: str) -> np.ndarray:
     try:
-        return file[name][()]
-    except (OSError, KeyError, RuntimeError) as error:
+        data = _within(file, name)
+        if (dtype := getattr(data, "dtype", None)) != np.uint8 or data.ndim != 3 or data.shape[2] != 3:
+            raise ValueError(f"it is {dtype} {getattr(data, 'shape', None)}, not uint8 [H, W, 3]")
+        if data.external or data.is_virtual:
+            raise ValueError("it shows the content of other files")
+        if (pixels := data.shape[0] * data.shape[1]) > MAX_PIXELS:
+            raise ValueError(f"it has {pixels:,} pixels: at most {MAX_PIXELS:,} are read")
+        return data[()]
+    except (OSError, KeyError, RuntimeError, ValueError) as error:
         raise ValueError(f"{name} cannot be read ({brief(error)})") from None
 
 
@@ -241,6 +264,8 @@ def split_objects(config: CalandraConfig, names: Sequence[str]) -> dict[str, str
         shuffled = owners_shuffle(names, config.split_seed)
         num_train = int(0.75 * len(shuffled))
         splits = {name: "train" if i < num_train else "test" for i, name in enumerate(shuffled)}
+    if not names:
+        raise ValueError(f"{config.path} holds no grasp that can be read: see its files, or download them again")
     if not splits:
         raise ValueError(f"{config.path} holds none of the authors' 40 objects: use split object, or more shards")
     train = sorted(name for name, split in splits.items() if split == "train")

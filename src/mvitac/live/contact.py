@@ -11,7 +11,7 @@ from mvitac.registry import check_range
 SIDE = 32  # side in pixels of the small pictures in which contact is detected
 LEAST_CHANGE = 1.0  # mean change in levels of R, G and B below which nothing counts as contact, however low the noise
 IMPRINT = 0.15  # share of a touch's largest change below which it has ended: a gel may keep an imprint of the press
-FOLLOW = 0.01  # share of the change by which the background is updated per frame while nothing is touched
+FOLLOW = 0.01  # share of the change by which a learned background is updated per frame while nothing is touched
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +89,7 @@ class Contact:
         else:
             self.imprint = min(self.imprint, change)
             self.touched, self.most = change > threshold + self.imprint, change
-        if not self.touched:
+        if not self.touched and self.free is None:
             self.background += FOLLOW * (small - self.background)
             if whole is not None and self.picture is not None:
                 self.picture += FOLLOW * (whole - self.picture)

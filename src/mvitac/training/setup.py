@@ -73,6 +73,9 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
 
     start = read_start(run.init)
     method, taken = _build_method(run, pack, rows, device, start)
+    if run.positives_within and method.views == 1 and run.positives != "same-touch-pairs":
+        how = "one view of each image: choose --positives same-touch-pairs"
+        raise ValueError(f"positives_within has no effect on method {run.method.name}, {how}")
     step = Step(run, method, device, world)
     done, validation = checkpoint.restore(out, run, method, step.optimiser, world)
     with nullcontext() if quiet or not world.is_main else shown():

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import math
 import re
 from dataclasses import dataclass, replace
 from functools import cache
@@ -88,6 +89,9 @@ class Presses(Source):
             # as its table wrote it: an empty cell is an unlabelled row, no number to repair
             "written label": {"material": "" if k == 9 else str(material)},
             "give-away": {"force": material + (obj * 7 + k * 5) % 11 / 10},
+            "in one class": {"force": columns["force"] if material == 1 else math.nan},
+            "few labels": {"label_material": material if k < 3 else -1},
+            "another name": {"number": 7 - material},
         }
         return [Sample(vision=vision, touch=touch, columns=columns | changes.get(fault, {}))]
 
@@ -151,6 +155,7 @@ FAULTS = {
     "labels": ("labels of material", "look", "first 00-01"),
     "sensor": ("columns that give a label away", "look", "sensor predicts material with 100 % accuracy"),
     "give-away": ("columns that give a label away", "look", "force predicts material with 91 % accuracy"),
+    "in one class": ("columns that give a label away", "look", "force predicts material with 70 % accuracy"),
 }
 
 
@@ -161,6 +166,14 @@ def test_each_fault_is_named_and_nothing_else(fault: str, tmp_path: Path) -> Non
     assert {f.item for f in findings.values() if f.verdict in ("look", "broken")} == {item}
     assert (findings[item].verdict, evidence in findings[item].evidence) == (verdict, True), findings[item].evidence
     assert findings[item].advice and exit_code(findings.values()) == {"look": 1, "broken": 2}[verdict]
+
+
+def test_what_the_search_for_give_aways_left_out_is_said(tmp_path: Path) -> None:
+    few, same = (
+        check(Presses(kind), tmp_path / kind)["columns that give a label away"] for kind in ("few labels", "another name")
+    )
+    assert few.verdict == "not checkable" and "material has 48 labelled rows outside test, 64 are" in few.evidence
+    assert same.verdict == "ok" and "number says the same as material" in same.evidence
 
 
 def test_classes_that_differ_in_spelling_only(pack: Pack) -> None:

@@ -127,9 +127,10 @@ def give_aways(pack: Pack) -> Finding:
     """Find columns of numbers, and sensors, that predict a label: confounds that a control probe should use.
 
     On the labelled rows outside test, the accuracy of the most frequent class in each eighth of the values (of each
-    sensor) is compared with that of the majority class. A column that is the label itself or a control is skipped.
+    sensor) is compared with that of the majority class; empty cells are a part of their own. A control is skipped, and a
+    column that is the label itself is only named.
     """
-    notes = []
+    notes, same, few = [], [], []
     other = {"id", *(task.name for task in pack.spec.tasks), *(c for used in pack.spec.controls.values() for c in used)}
     names = [pack.column(key).astype(str) for key in ("group", "touch_group") if key in pack.table.column_names]
     columns = [name for name in pack.table.column_names if not (name in other or name.startswith(PACKED))]
@@ -137,18 +138,25 @@ def give_aways(pack: Pack) -> Finding:
     for task in pack.spec.tasks:
         found = pack.labels(task.name, "train", "val")
         rows, found = np.flatnonzero(found >= 0), found[found >= 0]
+        few += [f"{task.name} has {len(rows)} labelled rows outside test, 64 are needed"] * (len(rows) < 64)
         for name in columns if len(rows) >= 64 else ():
             if name == "sensor":
                 notes += _predicts("sensor", task.name, pack.sensors[rows], found)
                 continue
             mine = _numbers(pack.column(name)[rows])
-            if mine is None or not np.isfinite(mine).all() or len(np.unique(mine)) < 2 or _is_label(mine, found):
+            if mine is None or len(np.unique(mine)) < 2:
                 continue
-            part = np.searchsorted(np.unique(np.quantile(mine, np.arange(1, 8) / 8)), mine)
-            notes += _predicts(name, task.name, part, found)
+            if _is_label(mine, found):
+                same.append(f"{name} says the same as {task.name}")
+                continue
+            there = np.isfinite(mine)
+            part = np.searchsorted(np.unique(np.quantile(mine[there], np.arange(1, 8) / 8)), mine)
+            notes += _predicts(name, task.name, np.where(there, part, -1), found)
     advice = "report them with every score as a control (--controls name=column)"
-    evidence = "; ".join(notes) or "no sensor and no column of numbers does"
-    return judged("columns that give a label away", evidence, advice, look=bool(notes))
+    item, evidence = "columns that give a label away", "; ".join(notes or ["no sensor and no column of numbers does"])
+    if few and len(few) == len(pack.spec.tasks):
+        return Finding(item, "not checkable", "; ".join(few))
+    return judged(item, "; ".join([evidence, *same, *few]), advice, look=bool(notes))
 
 
 def _is_label(values: np.ndarray, labels: np.ndarray) -> bool:
