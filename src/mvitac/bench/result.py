@@ -271,6 +271,10 @@ def _of_block(
         scored = [record.get("targets"), *(record["sums"][name] for name in ABOUT_ROWS if name in record["sums"])]
         if rows.setdefault(record["modality"], scored) != scored:
             yield f"{what}: is scored on other rows than those above it"
+    for own, other in itertools.product(*([r for r in records if bool(r["source"]) is of] for of in (False, True))):
+        known = other["source"] in ("pixels", "border") or own.get("clipped") != other.get("clipped")
+        if "targets" in own and known and own["modality"] == other["modality"] and own["sums"] == other["sums"]:
+            yield f"{own['modality']}, the encoder, {own['probe']}, seed {own['seed']}: has the sums of {other['source']}"
 
 
 Key = tuple[str, str, str, int | None]  # source ("" is the encoder), modality, probe, seed
@@ -334,4 +338,15 @@ def _impossible(record: dict[str, Any], num_groups: int, folds: int) -> str:
     wrong = (square < least * of).any() or (least * square > of)[n == 1].any()
     if record["source"] == "mean" and (n * squared < square - of - 1e-6 * square).any():  # one answer per group
         return "its errors are smaller than those of any one answer"
+    if record["source"] == "mean" and not folds and not _one_answer(n, squared, sums["value"], sums["squared_value"]):
+        return "its errors are not those of one answer"
     return "its squares are not those of its values" if wrong else ""
+
+
+def _one_answer(n: np.ndarray, squared: np.ndarray, value: np.ndarray, square: np.ndarray) -> bool:
+    """Whether one answer of each target gives the squared errors of all groups; all are [T, G + 1], the last of all rows."""
+    mean = value[:, -1:] / n[:, -1:]
+    away = np.sqrt(np.maximum((squared - square)[:, -1:] / n[:, -1:] + mean**2, 0))
+    errors = [abs(square - 2 * c * value + n * c**2 - squared) for c in (mean - away, mean + away)]
+    size = square + n * mean**2 + n * away**2
+    return bool((np.minimum(*((error > 1e-4 * size).any(1) for error in errors)) == 0).all())

@@ -43,6 +43,9 @@ def ablate(argv: list[str]) -> None:
         suite, cell = find_suite(name), tuple(cell)
         episodes = suite_episodes(suite, cell)
         policy = suite_policy(suite, cell, options.policy)
+    elif not options.data.exists():
+        known = "a pack's folder, nor a suite, a task and a condition"
+        raise ValueError(f"--data {options.data} is neither {known}; suites are {', '.join(shipped())}")
     elif options.out:
         raise ValueError(f"--out is a film of a suite, and --data {options.data} is none: leave it out")
     else:

@@ -101,6 +101,8 @@ def find(argv: list[str]) -> None:
     known = Embeddings(options.known, model.weights_digest())
     if (frames := model.spec.frames(options.source)) > 1:
         raise ValueError(f"{options.model} looks at {frames} frames: find takes one picture, search in Python instead")
+    if len(options.image) != (num := model.spec.channels(options.source) // 3):
+        raise ValueError(f"{options.model} looks at {num} images of {options.source}: {len(options.image)} are given")
     target = options.target or next((m for m in model.encoders if m != options.source), options.source)
     query, background = _picture(options.image), _picture(options.background) if options.background else None
     rows, cosines = known.find(model, query, options.source, target, options.num, background=background)

@@ -32,7 +32,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.windows import places, recordings
 from mvitac.datasets.lerobot import FELT
 from mvitac.deploy.artifact import load
-from mvitac.evaluation.intervals import mean_interval
+from mvitac.evaluation.intervals import interval, mean_interval
 from mvitac.registry import check_known
 from mvitac.system.files import brief
 from mvitac.system.progress import work
@@ -286,7 +286,10 @@ def ablate(policy: Policy, episodes: Episodes) -> dict[str, Any]:
     if again.shape != normal.shape or away(again, normal, scale).max() > SAME:
         raise ValueError("the policy acts differently on the same episodes: give it reset(), and seed what it draws")
     found = {sense: verdict(sense, [row for row in rows if row["sense"] == sense]) for sense in episodes.senses}
-    about = {"episodes": len(kept), "of": episodes.of, "unit": episodes.unit, "error": _paired(own, kept)[:3]}
+    error = _paired(own, kept)[:3]
+    if episodes.unit == "failures":  # 0 or 1 of each episode
+        error = list(interval([{"group_sizes": [1] * len(kept), "group_correct": [own[each[0]] for each in kept]}]))
+    about = {"episodes": len(kept), "of": episodes.of, "unit": episodes.unit, "error": error}
     return {**about, "rows": rows, "verdicts": found}
 
 

@@ -74,6 +74,8 @@ def build(
     stop_second_build()
     out = Path(out)
     check_request(store, size=size, workers=workers, max_damaged=max_damaged, quality=quality)
+    if not out.name:
+        raise ValueError(f"{out} already exists: choose another --out")
     if not out.exists() or not exist_ok:  # also takes away the lock of a process that was killed at its end
         with hold_lock(
             out, f"{out} is being packed by another process: waiting for it", wait=True, quiet=quiet

@@ -85,10 +85,12 @@ class Engine:
         """Names of the touch sensors that the model met, as far as its file says."""
         self.new_sensor: dict[str, Any] | None = self.meta["preprocessing"].get("new_sensor")
         """For an export for a sensor that the model never met: sensor, in_colours_of (known ones), num_images."""
-        from_json(dict[str, tuple[str, ...]], self.classes, "classes")
-        from_json(dict[str, tuple[_Target, ...]], self.values, "values")
-        from_json(tuple[str, ...], self.sensors, "sensors")
-        from_json(dict[str, str], self.crop, "crop")
+        where = f"{self.folder / EXPORT.name}: "
+        from_json(dict[str, tuple[str, ...]], self.classes, f"{where}classes")
+        from_json(dict[str, tuple[_Target, ...]], self.values, f"{where}values")
+        from_json(tuple[str, ...], self.sensors, f"{where}sensors")
+        from_json(dict[str, str], self.crop, f"{where}crop")
+        from_json(Runtime, self.meta["runtime"], f"{where}runtime")
         engine = self.meta["runtime"] if engine == "auto" else engine
         self._call = open_model(self.folder / MODEL, engine, self.meta["precision"], threads)
 

@@ -62,8 +62,10 @@ class Embeddings:
             self.table.select(["id", "group", "row"])  # KeyError if one is missing
             columns = {m: self.table.column(m) for m in ("vision", "touch") if m in self.table.column_names}
             whole = all(column.type.list_size and not column.null_count for column in columns.values())
-            assert whole and self.table.num_rows, "not one vector in every row"
-            given = {m: column.combine_chunks().flatten().to_numpy() for m, column in columns.items()}
+            parts = {m: column.combine_chunks().flatten() for m, column in columns.items()}
+            whole &= not any(part.null_count for part in parts.values())
+            assert whole and self.table.num_rows, "not one whole vector in every row"
+            given = {m: part.to_numpy() for m, part in parts.items()}
             assert not any(np.isinf(x).any() for x in given.values()), "infinite numbers"
             self.banks = {m: unit(x.reshape(self.table.num_rows, -1)) for m, x in given.items()}
             if about["weights"] != weights:

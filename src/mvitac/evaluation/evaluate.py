@@ -20,7 +20,7 @@ from mvitac.evaluation.encoders import Bound, open_encoders, probe_encoders
 from mvitac.evaluation.features import fitting
 from mvitac.evaluation.folds import fold_splits
 from mvitac.evaluation.leaks import CHOSE, UNKNOWN, Scored, Source, leaks_of, mark_split_leaks, read_sources
-from mvitac.evaluation.probe import probe_model, probes_of, seen_by, split_rows
+from mvitac.evaluation.probe import names_in, probe_model, probes_of, seen_by, split_rows
 from mvitac.evaluation.probe_config import ProbeConfig
 from mvitac.evaluation.retrieval import cross_modal, retrieved_rows
 from mvitac.evaluation.run_names import names_of
@@ -87,6 +87,9 @@ def probe_runs(
     names = [name + ", best" * (weights == "best") for name in names_of(paths, models)]
     pack = _common_pack(paths, models, pack)
     tasks, modalities = chosen(pack, session)
+    _check_reads([*zip(names, models, strict=True), *((model.title, model) for model, _ in others)], pack, modalities)
+    if session.standardise and (others or {*modalities} <= {"vision"}):
+        raise ValueError("--standardise changes the touch features of runs, not of vision or an --encoder: leave it out")
     _check_names({*names}, {model.title for model, _ in others}, {*CONTROLS, *pack.spec.controls})
     for model in models:
         fitting(model, pack)
@@ -117,6 +120,12 @@ def probe_runs(
         name = "probe" + ".best" * (weights == "best") + ".folds" * bool(session.folds)
         write_json(path / f"{name}.json", result, sealed=True)
     return result
+
+
+def _check_reads(models: Sequence[tuple[str, Any]], pack: Pack, modalities: Sequence[str]) -> None:
+    for name, model in models:
+        if not any({*names_in(m, pack)} <= {*model.encoders} for m in modalities):
+            raise ValueError(f"{name} does not read {' or '.join(modalities)}: choose other --modalities")
 
 
 def _check_names(runs: set[str], encoders: set[str], controls: set[str]) -> None:
