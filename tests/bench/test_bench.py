@@ -293,6 +293,19 @@ def no_mean(value: dict[str, Any]) -> None:
     sums |= {name: [[0.0 for _ in each] for each in sums[name]] for name in ("error", "squared_error")}
 
 
+def worse_mean(value: dict[str, Any]) -> None:
+    """Errors three times as large, which no one answer has."""
+    sums = next(r["sums"] for r in value["blocks"][1]["records"] if r["source"] == "mean")
+    for name, factor in (("error", 3), ("squared_error", 9)):
+        sums[name] = [[factor * x for x in each] for each in sums[name]]
+
+
+def as_pixels(value: dict[str, Any]) -> None:
+    """The encoder's values are those that pixels say."""
+    ours, *_ = records = value["blocks"][1]["records"]
+    ours["sums"] = next(r["sums"] for r in records if (r["source"], r["modality"]) == ("pixels", ours["modality"]))
+
+
 def other_unit(value: dict[str, Any]) -> None:
     """Values a thousand times as large, alike in each group, errors as they were: all R2 are 100 %."""
     for sums in (record["sums"] for record in value["blocks"][1]["records"]):
@@ -375,6 +388,8 @@ FORGED: dict[str, tuple[Change, str]] = {
     "a truth for a count": (put(*RECORDS, 0, "sums", "correct", 0, value=True), "its sums are no numbers"),
     "all guesses right": (all_right, "one answer is right for all rows"),
     "no error of a mean": (no_mean, "its errors are smaller than those of any one answer"),
+    "a worse mean": (worse_mean, "its errors are not those of one answer"),
+    "values of pixels": (as_pixels, "light: touch, the encoder, linear, seed 0: has the sums of pixels"),
     "errors in another unit": (other_unit, "its errors are smaller than those of any one answer"),
     "control of the data": (own_control, "lacks width, none, linear, None"),
     "note": (put("blocks", 0, "notes", value=[5]), "a leak mark, a note, a group or what groups are is no text"),

@@ -191,6 +191,7 @@ def test_in_a_closed_loop_success_is_the_measure() -> None:
     assert all(changes[kind] > 0.6 for kind in ("another episode", "mean frame", "noise"))
     blind = ablate(lambda o: [5.0 + o["state"][0], 0.0], suite_episodes(suite, ("both", "30")))
     assert blind["verdicts"]["touch"].startswith("The policy does not use touch") and blind["error"][0] > 0.8
+    assert felt["error"][1] == 0 < felt["error"][2] < 1 and blind["error"][1] > 0 and blind["error"][2] <= 1
 
 
 def test_a_film_without_touch_comes_after_the_table(
@@ -218,6 +219,7 @@ def test_film_and_learned_policy(tmp_path: Path, capsys: pytest.CaptureFixture[s
     with Image.open(tmp_path / "a.webp") as made:
         assert made.n_frames == 18 and made.size == (288, 288)
     for text, out, why in (
+        ("insert-v2/touch/30", "b.webp", "--data insert-v2/touch/30 is neither a pack's folder, nor a suite"),
         ("insert-v1/touch/31", "b.webp", "unknown task and condition"),
         (".", "b.webp", "--out is a film of a suite"),
         ("insert-v1/touch/30", "a.webp/b.webp", "cannot be written"),

@@ -204,6 +204,8 @@ EXPORTS: dict[str, tuple[dict[str, Any], str]] = {
         "file above": (ABOVE, "names others than"),
         "no tolerance": (lambda about: about.pop("tolerance"), "is damaged"),
         "no spread": (put("values", value={"force": [NO_SPREAD]}), "0 edges and 0 spreads: give n ascending"),
+        "a class that is no text": (put("classes", "pattern", value=[1]), r"export\.json: classes\.pattern: expected"),
+        "no runtime": (put("runtime", value="x"), r"export\.json: runtime"),
         "no inputs": (put("inputs", value={}), "cannot be run"),
         "too few classes": (put("classes", "pattern", value=["a"]), "damaged.*classes of pattern"),
     }.items()

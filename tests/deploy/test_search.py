@@ -76,6 +76,8 @@ def test_find_command_draws_what_it_found(
     for row in (one["row"] for one in found):
         picture = fit(pack.images["touch"][row], 160)
         assert any(picture[80].tobytes() in line.tobytes() for line in pixels)
+    assert main(["find", *[str(tmp_path / "q.png")] * 2, *of]) == 2
+    assert "looks at 1 images of touch: 2 are given" in capsys.readouterr().err
 
 
 def test_a_changed_file_or_another_models_is_refused(known: Path, tmp_path: Path, model: Model) -> None:
@@ -100,9 +102,9 @@ def test_vectors_that_another_program_changed_are_refused(known: Path, tmp_path:
         pq.write_table(table.slice(0, len(vectors)).set_column(at, "vision", column), file)
         return Embeddings(file, model.weights_digest())
 
-    infinite = [[math.inf] * len(whole[0])]
-    for vectors in ([None, *whole[1:]], [whole[0][1:], *whole[1:]], [*infinite, *whole[1:]], []):
-        with pytest.raises(ValueError, match=r"other\.parquet is damaged: .*(one vector|infinite|list_size)"):
+    infinite, none = [[math.inf] * len(whole[0])], [[None, *whole[0][1:]]]
+    for vectors in ([None, *whole[1:]], [*none, *whole[1:]], [whole[0][1:], *whole[1:]], [*infinite, *whole[1:]], []):
+        with pytest.raises(ValueError, match=r"other\.parquet is damaged: .*(one whole vector|infinite|list_size)"):
             opened(vectors)
     query = np.zeros((1, 32, 32, 3), np.uint8)
     assert opened(whole).find(model, query, "touch", "vision", 3)[1].shape == (1, 3)

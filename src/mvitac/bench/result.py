@@ -347,6 +347,5 @@ def _one_answer(n: np.ndarray, squared: np.ndarray, value: np.ndarray, square: n
     """Whether one answer of each target gives the squared errors of all groups; all are [T, G + 1], the last of all rows."""
     mean = value[:, -1:] / n[:, -1:]
     away = np.sqrt(np.maximum((squared - square)[:, -1:] / n[:, -1:] + mean**2, 0))
-    errors = [abs(square - 2 * c * value + n * c**2 - squared) for c in (mean - away, mean + away)]
-    size = square + n * mean**2 + n * away**2
-    return bool((np.minimum(*((error > 1e-4 * size).any(1) for error in errors)) == 0).all())
+    errors = np.array([abs(square - 2 * c * value + n * c**2 - squared) for c in (mean - away, mean + away)])
+    return bool((errors <= 1e-4 * (square + n * mean**2 + n * away**2)).all(2).any(0).all())

@@ -170,7 +170,8 @@ def test_each_fault_is_named_and_nothing_else(fault: str, tmp_path: Path) -> Non
 
 def test_what_the_search_for_give_aways_left_out_is_said(tmp_path: Path) -> None:
     few, same = (
-        check(Presses(kind), tmp_path / kind)["columns that give a label away"] for kind in ("few labels", "another name")
+        check(Presses(kind), tmp_path / kind)["columns that give a label away"]
+        for kind in ("few labels", "another name")
     )
     assert few.verdict == "not checkable" and "material has 48 labelled rows outside test, 64 are" in few.evidence
     assert same.verdict == "ok" and "number says the same as material" in same.evidence
