@@ -17,8 +17,8 @@ import numpy as np
 from mvitac.bench.external import ExternalModel, open_model
 from mvitac.bench.result import NO_IMAGENET, stored
 from mvitac.bench.suite import Opened, Suite, SuiteSet, SuiteTask, open_set
-from mvitac.data.lazy import Lazy
-from mvitac.data.pack import Images, Pack
+from mvitac.data.lazy import Changed
+from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask
 from mvitac.evaluation import few_labels
 from mvitac.evaluation.controls import Records, label_controls, pixel_controls
@@ -32,18 +32,6 @@ from mvitac.system.progress import work
 from mvitac.system.provenance import provenance
 
 
-class _Channels(Lazy):
-    """Some channels of images: one of several sensors that are stacked."""
-
-    def __init__(self, images: Images, kept: slice) -> None:
-        num, height, width, _ = images.shape
-        super().__init__((num, height, width, kept.stop - kept.start))
-        self.images, self.kept = images, kept
-
-    def _made(self, rows: np.ndarray) -> np.ndarray:
-        return self.images[rows][..., self.kept]
-
-
 def sensors(pack: Pack, modality: str, channels: int) -> list[Pack]:
     """Views of ``pack`` for an encoder of ``channels``: one for each of the sensors that are stacked."""
     if (have := pack.spec.channels(modality)) == channels:
@@ -51,7 +39,8 @@ def sensors(pack: Pack, modality: str, channels: int) -> list[Pack]:
     views = []
     for first in range(0, have, channels):
         views.append(view := copy.copy(pack))
-        view.images = {**pack.images, modality: _Channels(pack.images[modality], slice(first, first + channels))}
+        own = Changed(pack.images[modality], channels, lambda rows, x, i=first: x[..., i : i + channels])
+        view.images = {**pack.images, modality: own}
         view.digests = {**pack.digests, modality: f"channels from {first}"}
     return views
 

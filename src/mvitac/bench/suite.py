@@ -79,8 +79,6 @@ class SuiteSet:
 
 @dataclass(frozen=True, kw_only=True)
 class Suite:
-    """A versioned set of tasks."""
-
     name: str
     title: str
     probes: tuple[Probe, ...]  # probes of encoders; the page shows the first. Controls have the linear one.

@@ -32,7 +32,6 @@ class _Options:
 
 
 def ablate(argv: list[str]) -> None:
-    """mvitac ablate POLICY --data EPISODES [--out FILM] [--json FILE]"""
     options = parse(_Options, argv, "ablate")
     check_json(options.json)
     check_json(options.out, "--out")

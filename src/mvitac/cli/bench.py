@@ -62,7 +62,6 @@ _MANUAL = """Score an encoder on every task of a suite, beside the same controls
 
 
 def bench(argv: list[str]) -> None:
-    """mvitac bench MODEL... --suite NAME [--out DIR] [--data-root DIR]"""
     suites = [*shipped(), *loop.shipped()]
     options = parse(_Options, argv, "bench", description=_MANUAL.format(suites=", ".join(suites)))
     if not options.models:
@@ -94,7 +93,6 @@ def bench(argv: list[str]) -> None:
 
 
 def board(argv: list[str]) -> None:
-    """mvitac bench board FILE... [--out FILE.html]"""
     options = parse(_BoardOptions, argv, "bench board")
     check_json(options.out, "--out")
     write = loop.write_page if loop.is_result(options.files[0]) else write_board
@@ -102,7 +100,6 @@ def board(argv: list[str]) -> None:
 
 
 def check(argv: list[str]) -> None:
-    """mvitac bench check FILE..."""
     options = parse(_CheckOptions, argv, "bench check")
     for path in options.files:
         if loop.is_result(path):

@@ -74,7 +74,6 @@ _MANUAL = """Many runs into one table: methods x settings x seeds, next to contr
 
 
 def compare(argv: list[str]) -> None:
-    """mvitac compare --plan table1|table2|ablation|FILE [--data D] [--recipe R] [--seeds N] [--dry-run]"""
     chosen, rest = selectors(argv, ("--plan", "--data", "--recipe"))
     plan = find_plan(chosen.get("--plan", "table1"))
     check_known("recipe", [recipe := chosen.get("--recipe", plan.recipe)], RECIPES)

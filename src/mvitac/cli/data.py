@@ -33,7 +33,6 @@ class _BuildOptions:
 
 
 def pack(argv: list[str]) -> None:
-    """mvitac data pack --data NAME ... --out DIR"""
     chosen, rest = selectors(argv, ("--data",))
     if "--data" not in chosen:
         usage = f"mvitac data pack --data {'|'.join(DatasetConfig.choices)} --out DIR"
@@ -85,7 +84,6 @@ class _InfoOptions:
 
 
 def info(argv: list[str]) -> None:
-    """mvitac data info PACK [PACK ...] [--json FILE]"""
     options = parse(_InfoOptions, argv, "data info")
     check_json(options.json)
     pack = open_packs(options.pack)

@@ -50,7 +50,6 @@ class _SourceOptions(_Options):
 
 
 def check(argv: list[str]) -> int:
-    """mvitac data check PACK [PACK ...] | --data NAME ... [--json FILE] [--sheet FILE.png]"""
     chosen, rest = selectors(argv, ("--data",))
     paths = [w for b, w in zip(["", *rest], rest, strict=False) if b[:2] != "--" and Path(w).exists()]
     if "--data" not in chosen and paths and not (Path(paths[0]) / "pack.json").exists():

@@ -23,7 +23,6 @@ class _Options:
 
 
 def demo(argv: list[str]) -> None:
-    """mvitac demo [--recipe R] [--out DIR] [--seeds N] [fields]"""
     chosen, rest = selectors(argv, ("--recipe",))
     about = f"""Simulate materials, pre-train, probe and write a report. A second call resumes the first.
 

@@ -29,7 +29,6 @@ class _PublishOptions:
 
 
 def publish(argv: list[str]) -> None:
-    """mvitac publish RUN OUT [--on PACK]"""
     options = parse(_PublishOptions, argv, "publish")
     check_models(options.run)
     loading()
@@ -72,7 +71,6 @@ class _ExportOptions(ExportConfig):
 
 
 def export(argv: list[str]) -> None:
-    """mvitac export RUN|ARTIFACT --out DIR [--precision fp32|bf16|int8]"""
     options = parse(_ExportOptions, argv, "export")
     check_models(options.model)
     check_new(options.out)

@@ -41,7 +41,6 @@ class _ProbeOptions:
 
 
 def probe(argv: list[str]) -> None:
-    """mvitac probe RUN... [--encoder external:...] [--on PACK] [--learn-on PACK] [--json FILE]"""
     options = parse(_ProbeOptions, argv, "probe")
     check_json(options.json)
     check_models(*options.runs)
@@ -95,7 +94,6 @@ class _ReportOptions:
 
 
 def report(argv: list[str]) -> None:
-    """mvitac report RUN... [--out DIR]"""
     options = parse(_ReportOptions, argv, "report")
     check_models(*options.runs)
     loading()

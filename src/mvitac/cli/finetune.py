@@ -32,7 +32,6 @@ class _Options:
 
 
 def finetune(argv: list[str]) -> None:
-    """mvitac finetune MODEL --data D [--labels TASK...] [--values TASK...] --out DIR"""
     chosen, rest = selectors(argv, ("--data",))
     names = "|".join(DatasetConfig.choices)
     if "--data" not in chosen and not asks_help(rest):

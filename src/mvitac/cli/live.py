@@ -85,7 +85,6 @@ class _Options(_Common):
 
 
 def live(argv: list[str]) -> None:
-    """mvitac live MODEL [--vision SOURCE] [--touch SOURCE...] [--record DIR]"""
     options = parse(_Options, argv, "live")
     check_json(options.json)
     free = options.free()
@@ -165,7 +164,6 @@ class _PredictOptions(_Common):
 
 
 def predict(argv: list[str]) -> None:
-    """mvitac predict MODEL SOURCE | [--vision SOURCE] [--touch SOURCE...] [--out FILE.csv]"""
     options = parse(_PredictOptions, argv, "predict")
     files = not options.source or is_recording(options.source)
     if files and bool(options.source) == bool(options.vision or options.touch):

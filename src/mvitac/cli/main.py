@@ -46,7 +46,6 @@ HEAVY = ("demo", "pretrain", "finetune", "compare", "bench")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code."""
     if "OMP_WAIT_POLICY" not in os.environ:
         # Beside another busy program, threads that wait by spinning made a step take five times as long (docs/speed.md).
         os.environ.setdefault("GOMP_SPINCOUNT", "10000")

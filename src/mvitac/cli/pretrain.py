@@ -31,7 +31,6 @@ class _Options:
 
 
 def pretrain(argv: list[str]) -> None:
-    """mvitac pretrain --data D|--from run.json [--method M] [--recipe R] [--init RUN] [fields] --out DIR [--resume]"""
     chosen, rest = selectors(argv, ("--method", "--data", "--recipe", "--from", "--logger"))
     base = _chosen_run(chosen, rest, phased=False)
     if not asks_help(rest) and not {"--data", "--from"} & chosen.keys():

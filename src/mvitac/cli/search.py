@@ -38,7 +38,6 @@ class _EmbedOptions:
 
 
 def embed(argv: list[str]) -> None:
-    """mvitac embed PACK --model M --out FILE.parquet [--shared]"""
     options = parse(_EmbedOptions, argv, "embed")
     check_models(options.model)
     loading()
@@ -84,7 +83,6 @@ class _FindOptions:
 
 
 def find(argv: list[str]) -> None:
-    """mvitac find IMAGE --model M --known FILE.parquet [--from touch] [--to vision] [--json FILE]"""
     options = parse(_FindOptions, argv, "find")
     check_models(options.model)
     loading()

@@ -55,12 +55,9 @@ def build(
     """Read ``source`` into a new pack; an interrupted build continues from ``<out>.partial``.
 
     Args:
-        source: The dataset to read.
-        out: Folder of the new pack.
         size: Side of the stored images in pixels.
         workers: Number of processes; 0 = one per core.
         max_damaged: Largest fraction of damaged items to accept. They are listed in pack.json under "damaged".
-        quiet: Show no progress.
         store: "raw" pixels or "jpeg".
         quality: JPEG quality, 1 to 100.
         exist_ok: Return an existing pack instead of raising an error.

@@ -40,11 +40,21 @@ class Lazy(ABC):
         """Return the images uint8 [n, S, S, C] of ``rows`` [n], which are valid row numbers."""
 
 
+class Changed(Lazy):
+    """``images`` after ``change``: row numbers [n] and their images -> uint8 [n, S, S, ``channels``]."""
+
+    def __init__(self, images: Any, channels: int, change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
+        super().__init__((*images.shape[:3], channels))
+        self._images, self._change = images, change
+
+    def _made(self, rows: np.ndarray) -> np.ndarray:
+        return self._change(rows, self._images[rows])
+
+
 class Pieces(Lazy):
     """The images of several pieces, one after another; those of one piece are read together.
 
     Args:
-        shape: N, S, S, C.
         starts: First row of each piece, and N.
         piece: Number of a piece -> its images, which are resized if their side is not S; None: zeros.
     """

@@ -157,7 +157,6 @@ class Pack:
         """Return row numbers, ascending int64. Without ``by``, rows that are ``hidden`` are left out.
 
         Args:
-            splits: Splits to include.
             only: Column -> value that a row must have.
             having: Modalities of which a row must have an image.
             by: Column with the split.

@@ -149,7 +149,6 @@ class DataSpec:
         return self.frames(modality) * {"vision": self.vision_channels, "touch": self.touch_channels}[modality]
 
     def frames(self, modality: str) -> int:
-        """Frames of one image of ``modality``."""
         return self.window.frames if modality in self.window.of else 1
 
     @property

@@ -2,18 +2,16 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from tyro.conf import Fixed
 
 from mvitac.data.pack import Pack
+from mvitac.data.source import Source
 from mvitac.data.spec import QUALITY, Store, Window, check_request, stored_as
 from mvitac.data.windows import windowed
 from mvitac.registry import Registered, default
 from mvitac.system.files import cache_dir, check_place, digest
-
-if TYPE_CHECKING:
-    from mvitac.data.source import Source
 
 WINDOW = ("num_frames", "stride", "frames_of", "order", "short", "minus_first")
 """Options that say which frames a row shows. A pack stores every frame once, whatever they are."""
@@ -68,7 +66,6 @@ class DatasetConfig(Registered):
         return False
 
     def frame_window(self) -> Window:
-        """The frames that a row shows."""
         of = ("vision", "touch") if self.frames_of == "both" else (self.frames_of,)
         same = {name: getattr(self, name) for name in ("stride", "order", "short", "minus_first")}
         return Window(frames=self.num_frames, of=of, **same)
@@ -76,11 +73,11 @@ class DatasetConfig(Registered):
     def build_options(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in ("size", "workers", "store", "quality")}
 
-    def source(self) -> "Source":
+    def source(self) -> Source:
         """Return the source of samples; ValueError if the data does not exist, or is packed already."""
         raise ValueError(f"--data {self.name} reads packs: there is nothing to pack, use it to train and to probe")
 
-    def place(self, source: "Source | None" = None) -> Path:
+    def place(self, source: Source | None = None) -> Path:
         """Return the folder in the cache where ``open`` builds the pack of ``source``, by default of this dataset."""
         source = source or self.source()
         kept = stored_as(self.store, self.quality)

@@ -30,8 +30,6 @@ def value_task(name: str, columns: Sequence[str], **about: Any) -> ValueTask:
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedConfig(DatasetConfig):
-    """Options of all simulators."""
-
     names_a_place: ClassVar[bool] = False
     least: ClassVar[int] = 1
 
@@ -56,8 +54,6 @@ class SimulatedConfig(DatasetConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class PressConfig(SimulatedConfig):
-    """Options of simulated presses by which sensors."""
-
     difference: Annotated[bool, tyro.conf.arg(name="subtract-background")] = False
     """Store (touch - background) / 2 + 128, with the background of the same sensor; no contact is mid-gray."""
     makes: tuple[str, ...] = ()

@@ -22,7 +22,7 @@ from mvitac.deploy.artifact import preprocessing
 from mvitac.deploy.engine import CHECK, EXPORT, MODEL, Call, Runtime, cosines, open_model
 from mvitac.deploy.export_config import ExportConfig
 from mvitac.deploy.export_module import ExportModule, output_of, quantise, write_onnx
-from mvitac.evaluation.features import fitting_in_use, sample
+from mvitac.evaluation.features import fitting, sample
 from mvitac.evaluation.sensors import learn_looks
 from mvitac.model import Model
 from mvitac.system.device import has_bf16
@@ -54,7 +54,7 @@ def export(
     if new and "touch" not in asked:
         raise ValueError(f"{NEW_SENSOR} is about touch, which this export lacks: leave it out")
     for given in (known, pack):
-        if {*fitting_in_use(model, given, asked)} != {*asked} or given.size != model.stored:
+        if {*fitting(model, given, asked, in_use=True)} != {*asked} or given.size != model.stored:
             what = f"{' and '.join(asked)} at {model.stored} px"
             raise ValueError(f"{given.path} cannot check this model: it needs images of {what}")
     graph = ExportModule(model, asked, learn_looks(known, new, NEW_SENSOR) if new else None)

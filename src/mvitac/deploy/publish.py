@@ -16,7 +16,7 @@ from mvitac.deploy.artifact import preprocessing, read
 from mvitac.deploy.card import card
 from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import as_trained, check_unseen, noted, stored_result
-from mvitac.evaluation.features import fitting_in_use
+from mvitac.evaluation.features import fitting
 from mvitac.evaluation.leaks import FILE, Scored, Source, mark_split_leaks
 from mvitac.evaluation.probe import FittedProbes, probe_model, scorable, split_rows
 from mvitac.evaluation.regressors import Linear
@@ -42,7 +42,7 @@ def fit_probes(model: Model, pack: Pack) -> list[tuple[LinearProbe, dict[str, An
 
     That of values is ridge regression. A task without labelled rows in train and test has none: it could not be scored.
     """
-    modalities = fitting_in_use(model, pack)
+    modalities = fitting(model, pack, in_use=True)
     tasks = {m: scorable(pack, m) for m in (*modalities, *(["both"] if len(modalities) == 2 else []))}
     records: Records = []
     fitted: FittedProbes = {}

@@ -29,8 +29,11 @@ def sample(rows: np.ndarray, num: int, rng: np.random.Generator | None = None) -
     return np.sort(rng.choice(rows, min(num, len(rows)), replace=False))
 
 
-def fitting(model: Model, pack: Pack, among: Sequence[str] = MODALITIES) -> tuple[str, ...]:
-    """Those ``among`` modalities that model and pack have in common; ValueError if there are none, or images do not fit."""
+def fitting(model: Model, pack: Pack, among: Sequence[str] = MODALITIES, *, in_use: bool = False) -> tuple[str, ...]:
+    """Those ``among`` modalities that model and pack have in common; ValueError if there are none, or images do not fit.
+
+    ``in_use``: nor do difference images, where the model will be given plain ones.
+    """
     names = tuple(m for m in pack.spec.modalities if m in model.encoders and m in among)
     for modality in names:
         found, wanted = pack.spec.channels(modality), model.spec.channels(modality)
@@ -38,16 +41,10 @@ def fitting(model: Model, pack: Pack, among: Sequence[str] = MODALITIES) -> tupl
             raise ValueError(f"{pack.path} has {found} channels of {modality}, the model was trained with {wanted}")
     if "touch" in names and model.spec.difference and not pack.spec.difference:
         raise ValueError(f"{pack.path}: the model was trained on difference images: pack with --subtract-background")
+    if in_use and "touch" in names and pack.spec.difference and not model.spec.difference:
+        raise ValueError(f"{pack.path}: the model was trained without difference images: no --subtract-background")
     if not names:
         raise ValueError(f"{pack.path} has {', '.join(pack.spec.modalities)}, the model {', '.join(model.encoders)}")
-    return names
-
-
-def fitting_in_use(model: Model, pack: Pack, among: Sequence[str] = MODALITIES) -> tuple[str, ...]:
-    """As ``fitting``; ValueError also for difference images, where the model will be given plain ones."""
-    names = fitting(model, pack, among)
-    if "touch" in names and pack.spec.difference and not model.spec.difference:
-        raise ValueError(f"{pack.path}: the model was trained without difference images: no --subtract-background")
     return names
 
 

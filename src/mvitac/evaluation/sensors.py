@@ -4,12 +4,11 @@ All statistics come from images without labels. Shapes: features [N, D].
 """
 
 import copy
-from collections.abc import Callable, Collection
-from functools import partial
+from collections.abc import Collection
 
 import numpy as np
 
-from mvitac.data.lazy import Lazy
+from mvitac.data.lazy import Changed
 from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack
 from mvitac.data.spec import listed
@@ -106,21 +105,6 @@ def touch_features(
     return np.concatenate(parts)[np.argsort(order)]
 
 
-class _Recoloured(Lazy):
-    """Touch images, those of some sensors through a function."""
-
-    def __init__(self, pack: Pack, change: dict[int, Callable[[np.ndarray], np.ndarray]]) -> None:
-        self.images, self.sensors, self.change = pack.images["touch"], pack.sensors, change
-        super().__init__(self.images.shape)  # type: ignore[arg-type]
-
-    def _made(self, rows: np.ndarray) -> np.ndarray:
-        made = np.array(self.images[rows])
-        for number, change in self.change.items():
-            if (here := self.sensors[rows] == number).any():
-                made[here] = change(made[here])
-        return made
-
-
 class RecolouredPack(JoinedPack):
     """A joined pack that also shows the touches of sensors that ``learn`` lacks in the colours of those that it has.
 
@@ -139,9 +123,14 @@ class RecolouredPack(JoinedPack):
         self.looks = [self._look(learned, number, _colours_of(self, number, COLOURS)) for number in old]
 
     def _look(self, learned: dict[int, GelColours], number: int, target: GelColours) -> Pack:
+        def shown(rows: np.ndarray, images: np.ndarray) -> np.ndarray:
+            for n, own in learned.items():
+                if (here := self.sensors[rows] == n).any():
+                    images[here] = recolour(images[here], own, target)
+            return images
+
         look: Pack = copy.copy(self)
-        change = {n: partial(recolour, source=own, target=target) for n, own in learned.items()}
-        look.images = {**self.images, "touch": _Recoloured(self, change)}
+        look.images = {**self.images, "touch": Changed(self.images["touch"], 3, shown)}
         look.digests = {**self.digests, "colours": self.sensor_names[number]}
         return look
 

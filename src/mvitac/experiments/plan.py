@@ -25,9 +25,7 @@ class Row:
     """One line of the comparison: a method with its settings, run once per seed."""
 
     label: str
-    """Its name in the table."""
     method: str = "mvitac"
-    """A registered method."""
     recipe: str | None = None
     """A recipe other than the plan's."""
     set: dict[str, Any] = field(default_factory=dict)
@@ -42,9 +40,7 @@ class Plan:
 
     name: str
     rows: tuple[Row, ...]
-    """The lines of the table, in order."""
     title: str = ""
-    """Heading of the table."""
     reference: str = "MViTac"
     """Label of the row that all others are compared with."""
     recipe: str = "quick"

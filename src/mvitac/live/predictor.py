@@ -71,9 +71,7 @@ class Live:
     ) -> None:
         """
         Args:
-            engine: the exported model.
             streams: one stream per camera and sensor, by modality; two touch sensors are stacked in channels.
-            config: contact detection.
             clock: time in seconds, that of the streams.
             record: called with every pair that was used (images, columns).
             tell: called with every fault as it happens, in the thread that noticed it.

@@ -43,16 +43,18 @@ class DepthwiseConv2d(nn.Conv2d):
     """Depthwise ``Conv2d`` with a weight gradient of its own where that pays: in fp32 training on a CPU."""
 
     def forward(self, input: Tensor) -> Tensor:
-        return _depthwise(self, input, self.padding[0]) if _pays(self, input) else super().forward(input)  # type: ignore[arg-type]
+        if not _pays(self, input):
+            return super().forward(input)
+        return _Depthwise.apply(input, self.weight, self.stride[0], self.padding[0])  # type: ignore[return-value]
 
 
 class DepthwiseConv2dSame(Conv2dSame):
     """The same for timm's convolution that pads as TensorFlow does."""
 
     def forward(self, input: Tensor) -> Tensor:
-        if _pays(self, input):
-            return _depthwise(self, pad_same(input, self.kernel_size, self.stride), 0)  # type: ignore[arg-type]
         conv: Any = self
+        if _pays(self, input):
+            return _Depthwise.apply(pad_same(input, conv.kernel_size, conv.stride), conv.weight, conv.stride[0], 0)
         if torch.compiler.is_compiling() or conv.stride != (2, 2) or any(side % 2 for side in input.shape[-2:]):
             return super().forward(input)
         # One more pixel right and below: a kernel with a row and a column of zeros needs no copy of the map.
@@ -65,10 +67,6 @@ def _pays(conv: Any, input: Tensor) -> bool:
     small = pixels <= MAX_PIXELS_DEPTHWISE[conv.kernel_size[0]]
     plain = input.dtype == torch.float32 and not torch.is_autocast_enabled("cpu") and not torch.compiler.is_compiling()
     return small and plain and conv.training and input.device.type == "cpu"
-
-
-def _depthwise(conv: Any, input: Tensor, padding: int) -> Tensor:
-    return _Depthwise.apply(input, conv.weight, conv.stride[0], padding)  # type: ignore[return-value]
 
 
 PLAIN = {SmallMapConv2d: nn.Conv2d, DepthwiseConv2d: nn.Conv2d, DepthwiseConv2dSame: Conv2dSame}

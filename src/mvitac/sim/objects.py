@@ -45,7 +45,6 @@ class Part:
         return np.array([radius, half, radius] if self.lying else [radius, radius, half])
 
     def volume(self) -> float:
-        """Return the volume in cubic metres."""
         if self.shape == "box":
             return 8 * float(np.prod(self.size))
         if self.shape == "ellipsoid":
@@ -81,7 +80,6 @@ class Thing:
 
     @property
     def mass(self) -> float:
-        """Mass in kilograms."""
         return sum(part.volume() * part.density * self.density for part in self.parts)
 
     @property

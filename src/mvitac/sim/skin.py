@@ -72,7 +72,6 @@ class Patch:
 
 
 def draw_patch(rng: np.random.Generator) -> Patch:
-    """Draw the skin under the fingers of one grip."""
     peaks = bool(rng.random() < PEAKS)
     pattern, amplitude = Pattern(rng, 2.2, 4.5), float(0.09 * 2.5 ** rng.uniform())
     friction = float((GRIPS if peaks else SLIDES) * np.exp(rng.normal(0, 0.06)))

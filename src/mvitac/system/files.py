@@ -163,7 +163,6 @@ def digest(value: Any) -> str:
 
 
 def digest_file(path: Path) -> str:
-    """Return the sha256 (hex) of a file."""
     found = hashlib.sha256()  # hashlib.file_digest needs Python 3.11; ROS 2 Humble has 3.10
     with path.open("rb") as file:
         while part := file.read(1 << 20):

@@ -56,7 +56,6 @@ def train(
         run: What to train, e.g. ``mvitac.recipe("quick")``.
         out: Folder of the run. It must be new or empty, unless ``resume`` is set.
         resume: Continue from the last checkpoint in ``out``, if there is one.
-        quiet: Print nothing.
         loggers: Functions ``(step, values)`` that receive all logged values.
         pack: The data, if it is already open. Default: open it from ``run.data``.
         validate: Evaluate on held-out groups. It changes no weights.

@@ -20,8 +20,6 @@ from mvitac.run import Run
 
 @dataclass(frozen=True)
 class Start:
-    """What a run starts from."""
-
     init: Init
     model: Model
     sources: list[leaks.Source]  # what its weights were trained on

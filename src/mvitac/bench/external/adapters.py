@@ -155,8 +155,6 @@ def said(tag: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Python(Adapter):
-    """A function that returns a module and its preprocessing."""
-
     def load(self) -> Loaded:
         module, _, name = self.place.partition(":")
         sys.path.insert(0, str(Path.cwd()))  # as python -m does

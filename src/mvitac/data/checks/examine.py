@@ -14,9 +14,11 @@ from mvitac.data.source import Source
 Draw = Callable[[Pack, Sequence[Finding]], None]  # draws a contact sheet
 
 
-def examine(pack: Pack) -> list[Finding]:
+def examine(pack: Pack, *before: Finding, draw: Draw | None = None) -> list[Finding]:
+    """All findings about ``pack``, after those ``before``; and ``draw`` them."""
     looks = look_at(pack)
-    return [
+    findings = [
+        *before,
         table_checks.unreadable(pack),
         table_checks.missing_images(pack),
         image_checks.constant_frames(pack, looks),
@@ -33,6 +35,9 @@ def examine(pack: Pack) -> list[Finding]:
         duplicates.near_copies(pack, looks),
         table_checks.give_aways(pack),
     ]
+    if draw:
+        draw(pack, findings)
+    return findings
 
 
 def examine_pack(pack: str | Path | Pack, draw: Draw | None = None) -> list[Finding]:
@@ -45,10 +50,7 @@ def examine_pack(pack: str | Path | Pack, draw: Draw | None = None) -> list[Find
             if not (path / "pack.json").is_file():
                 raise
             return [judged("pack", str(error), "make it again; training refuses it, too", broken=True)]
-    findings = [Finding("pack", "ok", f"{pack.num} rows, every digest matches"), *examine(pack)]
-    if draw:
-        draw(pack, findings)
-    return findings
+    return examine(pack, Finding("pack", "ok", f"{pack.num} rows, every digest matches"), draw=draw)
 
 
 def examine_source(
@@ -61,7 +63,4 @@ def examine_source(
     with tempfile.TemporaryDirectory(prefix="mvitac-check-") as folder:
         pack = build(source, Path(folder) / "pack", size=size, workers=workers, max_damaged=1.0, quiet=quiet)
         read = f"{pack.spec.name}: {len(source.items())} items examined, kept at {size} px"
-        findings = [Finding("source", "ok", read), *examine(pack)]
-        if draw:
-            draw(pack, findings)
-        return findings
+        return examine(pack, Finding("source", "ok", read), draw=draw)

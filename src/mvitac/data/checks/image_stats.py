@@ -16,7 +16,6 @@ NUM_AT_ONCE = 128
 class ImageStats:
     """Statistics of the images of one sensor."""
 
-    name: str  # vision, touch, or touch 1 and touch 2 if stacked
     modality: str
     thumbs: np.ndarray  # uint8 [N, S, S, 3], area means
     fine: np.ndarray  # uint8 [N, F, F], area means of the channels' mean
@@ -41,18 +40,18 @@ class ImageStats:
 
 
 def look_at(pack: Pack) -> dict[str, ImageStats]:
-    """Return ``ImageStats`` by name, in the order of modalities. Needs about 2 kB of memory per image of any size."""
+    """Return ``ImageStats`` by name: vision, touch, or touch 1 and touch 2 if stacked. About 2 kB per image of any size."""
     found = {}
     for modality in pack.spec.modalities:
         num_sensors = pack.spec.channels(modality) // 3
         for sensor in range(num_sensors):
             name = modality if num_sensors == 1 else f"{modality} {sensor + 1}"
             channels = slice(3 * sensor, 3 * sensor + 3)
-            found[name] = _look(name, modality, pack.images[modality], channels, pack.has(modality))
+            found[name] = _look(modality, pack.images[modality], channels, pack.has(modality))
     return found
 
 
-def _look(name: str, modality: str, images: Images, channels: slice, has: np.ndarray) -> ImageStats:
+def _look(modality: str, images: Images, channels: slice, has: np.ndarray) -> ImageStats:
     num, size = images.shape[:2]
     side = min(SIDE, size)
     fine_side, every = min(FINE, size), max(1, size // 64)  # about 64 x 64 pixels suffice for a standard deviation
@@ -65,7 +64,7 @@ def _look(name: str, modality: str, images: Images, channels: slice, has: np.nda
         fine[at] = area_means(chunk, fine_side).mean(axis=3)
         std[at] = chunk[:, ::every, ::every].std(axis=(1, 2), dtype=np.float32).max(axis=1)
         exact[at] = [hashlib.blake2b(image, digest_size=8).hexdigest().encode() for image in chunk]
-    return ImageStats(name, modality, thumbs, fine, std, exact, has)
+    return ImageStats(modality, thumbs, fine, std, exact, has)
 
 
 def area_means(images: np.ndarray, side: int) -> np.ndarray:

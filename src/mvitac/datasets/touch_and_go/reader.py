@@ -103,13 +103,12 @@ class TouchAndGo(Source):
             lists.assign_official(listed, config.val_part, config.split_seed)
         else:
             lists.assign_by_recording(listed, config.test_share, config.val_part, config.split_seed)
-        self._recordings = {recording.name: recording for recording in found}
+        self._recordings = found
         self._chunks: list[list[Frame]] = []
         for _, own in itertools.groupby(listed, key=lambda frame: frame.recording):
             recording = list(own)
             self._chunks += [recording[i : i + CHUNK] for i in range(0, len(recording), CHUNK)]
-        frames = [(chunk[0].recording, [frame.number for frame in chunk]) for chunk in self._chunks]
-        self._stamps = [one_stamp(self._recordings[name].stamps(numbers)) for name, numbers in frames]
+        self._stamps = [one_stamp(stamps(found[chunk[0].recording], chunk)) for chunk in self._chunks]
         notes = lists.leaks(listed) if config.split == "official" else []
         notes += [lacking] * bool(missing)
         # A part of the recordings may have no frame of the rough lists.
@@ -118,7 +117,9 @@ class TouchAndGo(Source):
             "reader": f"touch-and-go {VERSION}",
             "lists": {name: digest_file(self._lists / name) for name in sorted(lists.LIST_FILES)},
             "options": {k: v for k, v in to_json(config).items() if k not in ("root", "lists", *KEEPING)},
-            "recordings": digest([[r.name, *(place.name for place in r.places.values())] for r in found]),
+            "recordings": digest(
+                [[name, *(place.name for place in places.values())] for name, places in found.items()]
+            ),
             "missing": dict(sorted(missing.items())),
         }
 
@@ -139,9 +140,8 @@ class TouchAndGo(Source):
 
     def read(self, item: int) -> list[Sample | Lost]:
         chunk, lost = self._chunks[item], {}
-        recording = self._recordings[chunk[0].recording]
-        numbers = [frame.number for frame in chunk]
-        images = {m: read_frames(at, numbers, self._config.size, lost) for m, at in recording.places.items()}
+        numbers, places = [frame.number for frame in chunk], self._recordings[chunk[0].recording]
+        images = {m: read_frames(at, numbers, self._config.size, lost) for m, at in places.items()}
         samples: list[Sample | Lost] = []
         for frame in chunk:
             if frame.number in lost:
@@ -185,29 +185,26 @@ def _spec(config: TouchAndGoConfig, rough: bool, notes: tuple[str, ...], missing
     )
 
 
-@dataclass(frozen=True)
-class Recording:
-    """A recording; ``places`` maps each modality to an mp4 file or a folder of JPEGs."""
+Places = dict[str, Path]
+"""Modality -> mp4 file or folder of JPEGs of one recording."""
 
-    name: str
-    places: dict[str, Path]
 
-    def stamps(self, numbers: Sequence[int]) -> Iterator[Stamp]:
-        for place in self.places.values():
-            files = [str(place)] if place.suffix else [f"{place}/{number:010d}.jpg" for number in numbers]
-            yield from map(stamp_of, files)
+def stamps(places: Places, frames: Sequence[Frame]) -> Iterator[Stamp]:
+    for place in places.values():
+        files = [str(place)] if place.suffix else [f"{place}/{frame.number:010d}.jpg" for frame in frames]
+        yield from map(stamp_of, files)
 
 
 def find_recordings(
     root: Path, names: Iterable[str], modalities: Sequence[str]
-) -> tuple[list[Recording], dict[str, str]]:
-    """Return the recordings in ``names`` with all ``modalities``, and why each of the others cannot be used."""
+) -> tuple[dict[str, Places], dict[str, str]]:
+    """Return the places of recordings in ``names`` with all ``modalities``, and why each of the others cannot be used."""
     base = root / "dataset" if (root / "dataset").is_dir() else root
     if not base.is_dir():
         raise ValueError(f"{base} is not a folder: give the download as --data.root; get it from {HOMEPAGE}")
     # Some mirrors append the material, as in 20220319_002026_rock.
     folders = {path.name[:15]: path for path in sorted(base.iterdir()) if path.is_dir()}
-    found, missing = [], {}
+    found, missing = {}, {}
     for name in names:
         folder = folders.get(name, base / name)
         places, lacking = {}, []
@@ -222,7 +219,7 @@ def find_recordings(
         if lacking:
             missing[name] = f"no {' and '.join(lacking)}" if folder.is_dir() else "no folder"
         else:
-            found.append(Recording(name, places))
+            found[name] = places
     return found, missing
 
 
