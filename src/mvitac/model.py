@@ -25,7 +25,8 @@ from mvitac.registry import check_known, from_json, to_json
 from mvitac.run import Run, load_run
 from mvitac.system.files import brief, digest, parse_json
 from mvitac.system.sealed_folder import ARTIFACT
-from mvitac.transforms.preprocess import ImageInput, Preprocess, check_images, encoder_input, resized, to_array
+from mvitac.transforms.preprocess import ImageInput, Preprocess, check_images, resized, to_array
+from mvitac.transforms.random_views import normalise, plain_view
 
 ABOUT = ("run", "spec", "stored")  # texts in the header of a file of weights
 MAX_STORED = 1024  # px: no pack holds larger images (``data.storage``)
@@ -77,7 +78,10 @@ class Model(nn.Module):
 
     def input(self, modality: str, images: Tensor, *, for_heads: bool = False) -> Tensor:
         """The normalised images [B, C, S, S] that an encoder takes, of uint8 or floats in [0, 1], with their gradients."""
-        return encoder_input(images, self.image_sizes(modality)[for_heads], self.mean_std(modality))
+        size, mean_std = self.image_sizes(modality)[for_heads], self.mean_std(modality)
+        if images.dtype == torch.uint8:
+            return plain_view(images, size, mean_std)
+        return normalise(resized(images.float(), size), mean_std)
 
     def __repr__(self) -> str:
         widths = ", ".join(f"{modality} {num_features(trunk)}" for modality, trunk in self.encoders.items())

@@ -39,9 +39,6 @@ class Material:
     sight: str
     feel: str
     colour: tuple[float, float, float]  # mean reflectance; instances vary widely around it
-    wavelength_mm: tuple[float, float] = (0.9, 2.4)
-    anisotropy: tuple[float, float] = (1.0, 1.3)
-    irregularity: tuple[float, float] = (0.1, 0.6)
     gloss: tuple[float, float] = (0.0, 0.3)
     soft: float = 0.5  # fraction of soft instances (thin sheets on foam, panels on rubber, ...)
     rough: float = 0.5
@@ -83,8 +80,8 @@ class Instance:
         self.soft, self.rough = rng.random() < m.soft, rng.random() < m.rough
         decades = rng.uniform(0.1, 0.6) if self.soft else -rng.uniform(0.1, 1.6)
         asperity = rng.uniform(0.3, 0.85) * (1 if self.rough else -1)
-        wavelength = np.exp(rng.uniform(*np.log(m.wavelength_mm)))
-        shared: Any = {"anisotropy": rng.uniform(*m.anisotropy), "irregularity": rng.uniform(*m.irregularity)}
+        wavelength = np.exp(rng.uniform(*np.log((0.9, 2.4))))  # mm
+        shared: Any = {"anisotropy": rng.uniform(1.0, 1.3), "irregularity": rng.uniform(0.1, 0.6)}
         ratio = rng.uniform(6.0, 9.0)
         shared |= {"asperity": asperity, "tables": draw_tables(rng)}
         self.sight = Relief(kind=m.sight, wavelength_mm=wavelength * ratio, **shared)

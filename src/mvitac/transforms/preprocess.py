@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mvitac.data.images import decode, difference, fit, to_rgb
 from mvitac.system.files import brief
-from mvitac.transforms.random_views import IMAGENET, MeanStd, normalise, plain_view
+from mvitac.transforms.random_views import IMAGENET, MeanStd, plain_view
 
 ImageInput = str | Path | np.ndarray | Tensor | Image.Image | Sequence[Any]
 """One image or several, as ``Model.embed`` accepts them."""
@@ -164,10 +164,3 @@ def resized(images: Tensor, side: int) -> Tensor:
     levels = images.contiguous(memory_format=torch.channels_last) if whole and images.is_cpu else images.float()
     levels = F.interpolate(levels, (side, side), mode="bilinear", antialias=True)
     return levels.round().to(torch.uint8) if whole and not images.is_cpu else levels
-
-
-def encoder_input(images: Tensor, size: int, mean_std: MeanStd = IMAGENET) -> Tensor:
-    """Images [B, C, H, W], uint8 or float in [0, 1], as normalised fp32 [B, C, size, size]; floats get gradients."""
-    if images.dtype == torch.uint8:
-        return plain_view(images, size, mean_std)
-    return normalise(resized(images.float(), size), mean_std)
