@@ -16,9 +16,6 @@ class Finding:
     advice: str = ""  # what to do; "" if nothing is wrong
     rows: Sequence[int] = ()  # suspicious rows for the contact sheet, of which ``MAX_ROWS`` are kept
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "rows", tuple(int(row) for row in self.rows[:MAX_ROWS]))
-
 
 def judged(
     item: str, evidence: str, advice: str, rows: Sequence[int] = (), *, look: bool = True, broken: bool = False
@@ -26,7 +23,7 @@ def judged(
     """A finding that is broken, worth a ``look``, or ok, and then without ``advice``."""
     wrong = look or broken
     verdict = "broken" if broken else "look" if look else "ok"
-    return Finding(item, verdict, evidence, advice * wrong, rows if wrong else ())
+    return Finding(item, verdict, evidence, advice * wrong, tuple(map(int, rows[:MAX_ROWS])) if wrong else ())
 
 
 def exit_code(findings: Iterable[Finding]) -> int:
