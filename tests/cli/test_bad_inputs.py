@@ -114,7 +114,6 @@ PACKED = "data pack --data folder --path {tmp}/presses.csv --touch-group press -
 WORDS: list[tuple[str, str, str]] = [
     ("", "pretrian", "did you mean 'pretrain'"),
     ("", "data info {tmp}/nowhere", "no pack at {tmp}/nowhere"),
-    ("", "pretrain --data {tmp}/pairs.csv --out {out}", "{tmp}/pairs.csv does not exist"),
     ("", "compare --plan mine.toml --data materials --out {out}", "mine.toml does not exist"),
     ("", "pretrain --from {run}/run.json --data pack --out {out}", "--data"),
     (PRETRAIN, "--encoder.trunk resnet81", "'resnet81'"),

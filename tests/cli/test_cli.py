@@ -19,13 +19,6 @@ from mvitac.registry import default
 from mvitac.run import Run
 from mvitac.training.loop import Interrupted
 
-
-def test_importing_the_package_imports_no_torch() -> None:
-    code = "import sys, mvitac; print('torch' in sys.modules, 'numpy' in sys.modules)"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert out.split() == ["False", "False"]
-
-
 WRONG = (
     "pretrain --data materials --recipe nosuch",
     "pretrain --data packs/nosuch",

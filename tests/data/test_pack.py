@@ -242,7 +242,7 @@ def test_parts_are_made_again_from_the_first_whose_files_have_changed(pack: Pack
 
 def test_damaged_items_stop_or_are_listed(tmp_path: Path) -> None:
     source = Toy(damaged=(3, 40))
-    with pytest.raises(ValueError, match=r"2 of 120 items cannot be read, first item 3: item 3 is damaged"):
+    with pytest.raises(ValueError, match=r"2 of 120 items cannot be read, first item 3: item 3 is damaged.*repair it"):
         build(source, tmp_path / "strict", size=32, quiet=True)
     lenient = build(source, tmp_path / "lenient", size=32, max_damaged=0.05, quiet=True)
     assert lenient.num == 118 and [name for name, _ in lenient.meta["damaged"]] == ["item 3", "item 40"]

@@ -19,7 +19,7 @@ from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.methods.ssvtp import SSVTPConfig
 from mvitac.model import load
-from mvitac.nn.encoders import EncoderConfig, PerFrame, build_trunk
+from mvitac.nn.encoders import PerFrame
 from mvitac.recipes import recipe
 from mvitac.training.loop import train
 from mvitac.training.sampler import draw_positives
@@ -139,14 +139,6 @@ def test_a_window_trains_probes_and_reloads(presses: Pack, tmp_path: Path, tempo
     assert found.shape == (presses.num, model.encoders["touch"].num_features)
     assert not isinstance(model.encoders["vision"], PerFrame)
     assert isinstance(model.encoders["touch"], PerFrame) == (temporal != "stack")
-
-
-def test_per_frame_features_are_averaged() -> None:
-    trunk = build_trunk(EncoderConfig(trunk="mvitac_tiny", weights="scratch", temporal="mean"), 6, 2).eval()
-    assert isinstance(trunk, PerFrame)
-    images = torch.randn(3, 6, 32, 32)
-    apart = [trunk.trunk(part) for part in images.split(3, dim=1)]
-    assert torch.allclose(trunk(images), (apart[0] + apart[1]) / 2, atol=1e-6)
 
 
 def test_positives_can_be_near_in_time(presses: Pack, tmp_path: Path) -> None:

@@ -350,8 +350,8 @@ def test_a_crop_is_cut_out_of_images_and_backgrounds(tmp_path: Path) -> None:
     assert (flat.images["touch"] == 128 + 5 * np.arange(12)[:, None, None, None]).all()
     with pytest.raises(ValueError, match=r"0\.png is 40 x 20: crop 21:4:20:16 is larger"):
         packed(FolderConfig(**options, crop=("left=0:4:20:16", "right=21:4:20:16")), tmp_path / "no")
-    for wrong in ("left", "left=1:2:3", "left=0:0:0:4", "left=-1:0:4:4"):
-        with pytest.raises(ValueError, match="write COLUMN=x:y:width:height"):
+    for wrong in ("left", "left=1:2:3", "left=0:0:0:4", "left=-1:0:4:4", "left=0:0:.5:5"):
+        with pytest.raises(ValueError, match=f"'{wrong}': write COLUMN=x:y:width:height"):
             FolderConfig(**options, crop=(wrong,))
 
 

@@ -344,18 +344,6 @@ def test_image_parquet_of_the_hub(tmp_path: Path) -> None:
     assert len({level(image) for image in pack.images["touch"]}) == 30
 
 
-def test_the_scale_of_16_bits_holds_inside_parquet(tmp_path: Path) -> None:
-    rows = []
-    for i in range(20):
-        buffer = io.BytesIO()
-        Image.fromarray(np.full((16, 20), 10 * i, np.uint16)).save(buffer, "PNG")
-        rows.append({"touch": buffer.getvalue(), "thing": i})
-    pq.write_table(pa.Table.from_pylist(rows), tmp_path / "a.parquet")
-    pack = packed(FolderConfig(path=tmp_path / "a.parquet", range=("touch=0:200",), size=16), tmp_path / "pack")
-    assert np.abs(pack.images["touch"][:, 8, 8, 0] - 12.75 * np.arange(20)).max() <= 0.5
-    assert pack.spec.notes[0] == "touch has more than 8 bits: 0 is black, 200 white"
-
-
 def test_a_table_shows_no_image_of_other_folders(tmp_path: Path) -> None:
     secret, link = tmp_path / "secret.png", tmp_path / "data" / "link.png"
     link.parent.mkdir()
@@ -366,15 +354,6 @@ def test_a_table_shows_no_image_of_other_folders(tmp_path: Path) -> None:
         pq.write_table(pa.Table.from_pylist(rows), link.parent / "d.parquet")
         with pytest.raises(ValueError, match=r"1 of 20 samples .*row 3 touch holds no image"):
             packed(FolderConfig(path=link.parent / "d.parquet", labels=("kind",), size=16), tmp_path / "pack")
-
-
-def test_a_bad_cell_costs_its_own_row_only(tmp_path: Path) -> None:
-    rows = [{"touch": b"no picture" if i == 3 else png(i), "kind": i % 2} for i in range(20)]
-    pq.write_table(pa.Table.from_pylist(rows), tmp_path / "bad.parquet")
-    source = FolderConfig(path=tmp_path / "bad.parquet", labels=("kind",), size=16).source()
-    pack = build(source, tmp_path / "pack", size=16, quiet=True, max_damaged=0.1)
-    assert [level(image) for image in pack.images["touch"]] == [i for i in range(20) if i != 3]
-    assert [name for name, _ in pack.meta["damaged"]] == ["row 4"]
 
 
 def test_hub_parquet_with_gaps(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import torch
 
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
-from mvitac.data.source import Sample
 from mvitac.datasets.pack import PackConfig
 from mvitac.deploy import search
 from mvitac.deploy.export import ExportConfig, _examples, export
@@ -23,7 +22,7 @@ from mvitac.recipes import recipe
 from mvitac.training.loop import train
 from mvitac.training.sampler import draw_positives
 from mvitac.training.views import StepViews
-from support.toy import Holes, Toy
+from support.toy import Holes, Toy, altered
 
 
 @pytest.fixture(scope="module")
@@ -42,14 +41,9 @@ def test_holes_are_zeros_and_marked(holes: Pack) -> None:
 
 @pytest.mark.parametrize("column", [True, None])
 def test_an_image_must_agree_with_its_mark(tmp_path: Path, column: bool | None) -> None:
-    class Lying(Toy):
-        def read(self, item: int) -> list[Sample]:
-            (sample,) = super().read(item)
-            mark = {} if column is None else {"has_touch": column}
-            return [replace(sample, touch=None if item == 3 else sample.touch, columns={**sample.columns, **mark})]
-
+    lying = altered(Toy(), lambda sample, item: {"touch": sample.touch if item != 3 else None, "has_touch": column})
     with pytest.raises(ValueError, match="first item 3: no touch image, against its column has_touch"):
-        build(Lying(), tmp_path / "p", size=32, quiet=True)
+        build(lying, tmp_path / "p", size=32, quiet=True)
 
 
 def test_training_sees_whole_pairs_only(holes: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -125,7 +125,6 @@ def test_a_split_that_cuts_a_video_is_refused_and_seen_by_the_doctor(films: Path
     [
         ({"frame": ""}, r"row 2: 0/camera\.mp4 is a video, frame '': give the frame"),
         ({"touch_frame": "1.5"}, r"row 2: 0/gel\.avi .* touch_frame '1\.5'"),
-        ({"frame": 40}, r"camera\.mp4: frame 40 is wanted, the video ends after frame 39"),
     ],
 )
 def test_bad_frames_are_named(films: Path, tmp_path: Path, cells: dict[str, Any], says: str) -> None:

@@ -30,7 +30,7 @@ from mvitac.report.tables import print_finetuning
 from mvitac.run import load_run
 from mvitac.system.files import read_json
 from mvitac.training.loop import train
-from support.toy import Toy, toy_pack
+from support.toy import Toy, altered, toy_pack
 from support.training_runs import assert_equal_weights, power_cut, smoke
 
 ASKED = Finetuning(labels=("pattern",), lr=(1e-3, 3e-3), steps=(3,), batch_size=16)
@@ -184,14 +184,8 @@ def test_settings_are_the_best_on_held_out_groups(tuned: Path) -> None:
 
 def edited(pack: Pack, to: Path, **columns: Any) -> Path:
     """A pack of the same images, with other values in some columns: functions of an item's own columns."""
-
-    class Other(Toy):
-        def read(self, item: int) -> Any:
-            (sample,) = super().read(item)
-            sample.columns.update({name: value(dict(sample.columns)) for name, value in columns.items()})
-            return [sample]
-
-    return build(Other(), to, size=pack.size, workers=1, quiet=True).path
+    other = altered(Toy(), lambda sample, _: {name: value(sample.columns) for name, value in columns.items()})
+    return build(other, to, size=pack.size, workers=1, quiet=True).path
 
 
 def test_test_labels_decide_nothing(ancestor: Path, pack: Pack, tuned: Path, tmp_path: Path) -> None:

@@ -14,11 +14,11 @@ from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.deploy.publish import publish
-from mvitac.evaluation.leaks import read_sources, weights_files
+from mvitac.evaluation.leaks import read_sources
 from mvitac.methods.byol import BYOLConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.model import fresh, load
-from mvitac.nn.encoders import Encoders, PerFrame, build_trunk
+from mvitac.nn.encoders import PerFrame, build_trunk
 from mvitac.nn.initial import Init
 from mvitac.nn.momentum import Momentum
 from mvitac.nn.weights import _say, adapt_stem
@@ -173,18 +173,6 @@ def test_leaks_of_ancestors_are_told(pack: Pack, chain: dict[str, Path], capsys:
             assert main([*asked, "--allow-leak"]) == 0 and " LEAK" in capsys.readouterr().out
     card = " ".join((chain["art"] / "README.md").read_text().split())
     assert "Started from the weights of b " in card and " LEAK" in card
-
-
-def test_weights_of_a_file_may_hide_a_leak(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """With ``--encoder.weights FILE``, too: nothing says what the file was trained on, so none can be excluded."""
-    encoder, file = Encoders().changed(trunk="test_resnet.r160_in1k", weights="scratch"), tmp_path / "trunk.safetensors"
-    save_file(build_trunk(encoder.touch, 3).state_dict(), file)
-    run = smoke(pack, steps=1, eval_every=0)
-    train(replace(run, encoder=encoder.changed(weights=str(file))), tmp_path / "run", quiet=True)
-    said = capsys.readouterr().err
-    assert said.startswith("mvitac: warning: nothing says what ") and "trunk.safetensors was trained on" in said
-    assert main(["probe", str(tmp_path / "run"), "--tasks", "pattern", "--no-controls"]) == 0
-    assert " LEAK?" in capsys.readouterr().out and weights_files(replace(run, encoder=encoder)) == []
 
 
 def test_pretrain_warns_of_seen_test_rows(
