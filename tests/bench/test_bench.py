@@ -287,12 +287,6 @@ def all_right(value: dict[str, Any]) -> None:
     record["sums"]["correct"] = record["sums"]["n"]
 
 
-def no_mean(value: dict[str, Any]) -> None:
-    """One answer for all rows, which is never wrong."""
-    sums = next(r["sums"] for r in value["blocks"][1]["records"] if r["source"] == "mean")
-    sums |= {name: [[0.0 for _ in each] for each in sums[name]] for name in ("error", "squared_error")}
-
-
 def worse_mean(value: dict[str, Any]) -> None:
     """Errors three times as large, which no one answer has."""
     sums = next(r["sums"] for r in value["blocks"][1]["records"] if r["source"] == "mean")
@@ -387,7 +381,6 @@ FORGED: dict[str, tuple[Change, str]] = {
     "no imagenet": (lambda value: value["blocks"][1].pop("notes"), "lacks imagenet, touch, linear, None"),
     "a truth for a count": (put(*RECORDS, 0, "sums", "correct", 0, value=True), "its sums are no numbers"),
     "all guesses right": (all_right, "one answer is right for all rows"),
-    "no error of a mean": (no_mean, "its errors are smaller than those of any one answer"),
     "a worse mean": (worse_mean, "its errors are not those of one answer"),
     "values of pixels": (as_pixels, "light: touch, the encoder, linear, seed 0: has the sums of pixels"),
     "errors in another unit": (other_unit, "its errors are smaller than those of any one answer"),

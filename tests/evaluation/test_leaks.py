@@ -20,7 +20,6 @@ from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.row_hashes import image_sums, known_images
-from mvitac.data.several import JoinedPack
 from mvitac.data.source import Sample
 from mvitac.data.spec import Window
 from mvitac.data.windows import windowed
@@ -275,12 +274,6 @@ def test_numbers_of_rows_are_no_groups(pack: Pack) -> None:
     learned = source_of(other, rows)
     assert scored.leak([replace(learned, ids=np.ones(1, np.uint64), images=np.zeros(0, np.uint64))], rows) == ""
     assert scored.leak([learned], rows) == "72 of 72 test rows were trained on (toy)"
-
-
-def test_rows_of_two_joined_packs_keep_their_ids(pack: Pack, turned: Pack) -> None:
-    joined = JoinedPack(pack, pack)
-    assert (joined.own_ids == np.tile(pack.column("id"), 2)).all()
-    assert Scored(joined).leak([source_of(pack, pack.rows("train"))], joined.rows("test")) == ""
 
 
 def test_summaries_and_folds_keep_the_leak() -> None:

@@ -27,7 +27,7 @@ from mvitac.training.loop import train
 from mvitac.training.start import describe, load_start, load_trunk, read_start
 from support.small_methods import TINY
 from support.toy import toy_pack
-from support.training_runs import assert_equal_weights, power_cut, smoke, weights
+from support.training_runs import power_cut, smoke, train_twice, weights
 
 
 def started(pack: Pack, init: Init, **changes: object) -> tuple[Run, torch.nn.Module, dict[str, list[str]]]:
@@ -124,14 +124,9 @@ def test_digest_is_that_of_the_content(pack: Pack, smoke_run: Path, artifact: Pa
 
 def test_killed_and_resumed_equals_straight(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
     run = smoke(pack, init=Init(path=smoke_run), checkpoint_every=1, seed=3, steps=4, eval_every=0)
-    train(run, tmp_path / "straight", quiet=True)
-    for name, cut in (("early", 1), ("late", 3)):
-        with power_cut(cut), pytest.raises(RuntimeError, match="power cut"):
-            train(run, tmp_path / name, quiet=True)
-        train(run, tmp_path / name, resume=True, quiet=True)
-        assert_equal_weights(tmp_path / "straight", tmp_path / name)
-    train(replace(run, init=Init()), tmp_path / "scratch", quiet=True)
-    assert not torch.equal(*(weights(tmp_path / n)["encoders.touch.conv1.0.weight"] for n in ("straight", "scratch")))
+    early, _ = (train_twice(run, tmp_path / name, cut=cut) for name, cut in (("early", 1), ("late", 3)))
+    scratch = train(replace(run, init=Init()), tmp_path / "scratch", quiet=True)
+    assert not torch.equal(*(weights(path)["encoders.touch.conv1.0.weight"] for path in (early, scratch)))
 
 
 def test_other_weights_are_refused_at_resume(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
