@@ -176,4 +176,4 @@ def main(manifests: Path, name: str, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]))
+    main(Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3])) if len(sys.argv) > 3 else sys.exit(__doc__)

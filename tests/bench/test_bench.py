@@ -294,10 +294,11 @@ def worse_mean(value: dict[str, Any]) -> None:
         sums[name] = [[factor * x for x in each] for each in sums[name]]
 
 
-def as_pixels(value: dict[str, Any]) -> None:
-    """The encoder's values are those that pixels say."""
-    ours, *_ = records = value["blocks"][1]["records"]
-    ours["sums"] = next(r["sums"] for r in records if (r["source"], r["modality"]) == ("pixels", ours["modality"]))
+def copied(to: str, of: str, value: dict[str, Any]) -> None:
+    """The values of one source are those that another one says."""
+    records = value["blocks"][1]["records"]
+    one, other = (next(r for r in records if r["source"] == source) for source in (to, of))
+    one["sums"] = other["sums"]
 
 
 def other_unit(value: dict[str, Any]) -> None:
@@ -310,6 +311,12 @@ def other_unit(value: dict[str, Any]) -> None:
 def own_control(value: dict[str, Any]) -> None:
     """The suite asks for a column of the data."""
     value["suite"]["sets"][0]["forms"][0]["data"] = {"name": "folder", "controls": ["width = w,h"]}
+    value["suite_digest"] = suite_of(value).digest()
+
+
+def own_values(value: dict[str, Any]) -> None:
+    """The suite says which values the data has."""
+    value["suite"]["sets"][0]["forms"][0]["data"] = {"name": "folder", "values": ["light=lumen:lm"]}
     value["suite_digest"] = suite_of(value).digest()
 
 
@@ -339,7 +346,8 @@ def simulated(value: dict[str, Any]) -> None:
 
 def no_touch(value: dict[str, Any]) -> None:
     """One task is left out, as if the encoder had no touch, which other tasks have scores of."""
-    del value["encoder"]["parameters"]["touch"]
+    for about in ("parameters", "features"):
+        del value["encoder"][about]["touch"]
     not_run(value["blocks"][1], NO_TOUCH)
 
 
@@ -382,7 +390,13 @@ FORGED: dict[str, tuple[Change, str]] = {
     "a truth for a count": (put(*RECORDS, 0, "sums", "correct", 0, value=True), "its sums are no numbers"),
     "all guesses right": (all_right, "one answer is right for all rows"),
     "a worse mean": (worse_mean, "its errors are not those of one answer"),
-    "values of pixels": (as_pixels, "light: touch, the encoder, linear, seed 0: has the sums of pixels"),
+    "values of pixels": (partial(copied, "", "pixels"), "light: touch, the encoder, linear, seed 0: has the sums of"),
+    "controls alike": (partial(copied, "border", "pixels"), "touch, .*, linear, seed None: has the sums of touch, "),
+    "a control knows nothing": (partial(copied, "untrained", "mean"), "untrained, seed 0: has the sums of mean"),
+    "no unit": (put(*VALUES, "targets", value=[["light"]]), "not names and units"),
+    "other seed": (put("encoder", "external", value={"seed": 9}), "its network is of other seeds, weights or senses"),
+    "no features": (put("encoder", "features", value={}), "its features and parameters are of other senses"),
+    "unit of the suite": (own_values, r"its values are .*, those of the suite \[\['lumen', 'lm'\]\]"),
     "errors in another unit": (other_unit, "its errors are smaller than those of any one answer"),
     "control of the data": (own_control, "lacks width, none, linear, None"),
     "note": (put("blocks", 0, "notes", value=[5]), "a leak mark, a note, a group or what groups are is no text"),
@@ -449,7 +463,9 @@ def test_what_a_result_says_of_rows_and_of_leaks_is_compared(
     forged = changed(results[1], tmp_path / "a.json", more_spread, signed=True)
     assert main(["bench", "check", str(forged)]) == 0
     assert "the control mean differs between" in said(capsys, "bench", "board", results[0], forged)
-    nothing = partial(untrained_as, lambda one, other: one["modality"] == "none")  # their features are constant
+    nothing = partial(
+        untrained_as, lambda one, other: one is other if "targets" in other else one["modality"] == "none"
+    )
     assert main(["bench", "check", str(changed(results[1], tmp_path / "a.json", nothing, signed=True))]) == 0
     forged = changed(results[1], tmp_path / "a.json", blind_pixels, signed=True)
     assert main(["bench", "check", str(forged)]) == 0

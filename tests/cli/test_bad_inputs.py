@@ -140,6 +140,8 @@ WORDS: list[tuple[str, str, str]] = [
     (PRETRAIN, "--data.frames-of both", "--data.frames-of is for rows of several frames"),
     (PRETRAIN, "--data.order press --data.minus-first --data.stride 2", "--data.stride is for rows of several frames"),
     ("data pack --data materials --num 20 --out ", ".", ". already exists: choose another --out"),
+    ("compare --dry-run ", "--set steps=3 steps=5", "--set steps is given twice"),
+    ("compare --plan recipes --dry-run ", "--recipe smoke", "--recipe smoke has no effect: every row of recipes has"),
     ("probe {run} ", "{run}", "twice"),
     ("probe {run} --modalities vision ", "--standardise features", "the touch features of runs, not of vision"),
     (

@@ -1,10 +1,12 @@
 """The pack: whole or not there, resumable to the same bytes, and never mistaken for something else."""
 
+import contextlib
 import errno
 import fcntl
 import io
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -340,3 +342,41 @@ def test_rows_of_one_task_alone_are_hidden_from_all_else(pack: Pack) -> None:
     assert set(other.rows("train", by="split_bright")) == set(range(0, pack.num, 2))  # its own split has them
     assert not {*retrieved_rows(other, "test")} & hidden and hidden < {*retrieved_rows(pack, "test")}
     assert not with_columns(pack, **columns).hidden.any()  # one split for all tasks: nobody else may see them
+
+
+SLOW = """
+import os, time
+from mvitac.data.build import build
+from support.toy import Toy
+
+class Slow(Toy):
+    def read(self, item):
+        print("it reads", flush=True)
+        time.sleep(600)
+
+if __name__ == "__main__":
+    try:
+        build(Slow(), "p", size=32, workers=2, quiet=True)
+    except KeyboardInterrupt:
+        pass
+else:
+    print("a worker starts", flush=True)
+    time.sleep(1)
+"""
+
+
+@pytest.mark.parametrize(("kind", "line"), [(signal.SIGKILL, "it reads"), (signal.SIGINT, "a worker starts")])
+def test_workers_end_with_the_process_that_packs(kind: signal.Signals, line: str, tmp_path: Path) -> None:
+    """They hold its stdout: whoever reads it would wait for ever. Ctrl-C reaches those that are just starting, too."""
+    (tmp_path / "pack.py").write_text(SLOW)
+    about: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "start_new_session": True, "text": True}
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen([sys.executable, "pack.py"], cwd=tmp_path, env=env, **about) as packing:
+        assert packing.stdout and line in map(str.strip, packing.stdout)
+        (os.kill if kind == signal.SIGKILL else os.killpg)(packing.pid, kind)
+        try:
+            said = packing.communicate(timeout=60)[1]
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(packing.pid, signal.SIGKILL)
+    assert "Traceback" not in said

@@ -193,6 +193,7 @@ ARTIFACTS: dict[str, tuple[dict[str, Any], str]] = {
     "without model": ({"about": lambda about: about["files"].pop(MODEL)}, "lacks files"),
     "normalisation": ({"about": put("preprocessing", "mean", value=[0.5] * 3)}, f"mean is .*, {OTHER}"),
     "side": ({"about": put("preprocessing", "size", value=31)}, f"size is 31, {OTHER}"),
+    "no majority": ({"about": put("probes", 0, "majority", value=[])}, r"artifact\.json: probes\.majority: expected"),
     "probe of sound": ({"about": put("probes", 0, "modality", value="sound")}, "is damaged"),
     "wide probe": ({"probes": {WEIGHT: torch.zeros(3, 9)}}, "reads 9 features"),
     "short bias": ({"probes": {BIAS: torch.zeros(2)}}, "do not fit 3 outputs"),

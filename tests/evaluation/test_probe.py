@@ -1,6 +1,7 @@
 """Probes and their controls: they find what is there, choose nothing on test, and count few labels honestly."""
 
 import io
+import os
 import re
 import shutil
 import textwrap
@@ -20,7 +21,15 @@ from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation import controls
 from mvitac.evaluation import features as features_module
 from mvitac.evaluation.classifiers import fit_knn, fit_linear, fit_papers
-from mvitac.evaluation.controls import borders, controls_of, frozen_trunks, imagenet_trunk, starts_of, thumbnails
+from mvitac.evaluation.controls import (
+    borders,
+    controls_of,
+    frozen_trunks,
+    imagenet_trunk,
+    label_controls,
+    starts_of,
+    thumbnails,
+)
 from mvitac.evaluation.diagnostics import linear_probe
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import _folded
@@ -177,6 +186,10 @@ def test_damaged_cached_features_are_computed_again(
     file.write_bytes({"bit": bytes(bit), "cut": whole[:500], "no digest": whole[:-32]}[damage])
     np.testing.assert_array_equal(features_module.features(model, pack, "touch", rows), first)
     assert file.read_bytes() == whole
+    file.unlink()
+    os.mkfifo(file)  # it was read without an end
+    with pytest.raises(ValueError, match="neither a file nor a folder"):
+        features_module.features(model, pack, "touch", rows)
 
 
 @pytest.mark.parametrize("same", [True, False])
@@ -324,6 +337,16 @@ def test_few_values_keep_two_of_each_target(measured: Pack) -> None:
     for kept in (rows.train[train], rows.val[val]):
         assert np.isfinite(pack.values(task)[kept]).any(0).all()
     assert len(np.unique(pack.values(task)[rows.train[train], 0])) > 1
+
+
+def test_a_control_of_values_sees_as_few_labels(measured: Pack) -> None:
+    task, few_kind = measured.spec.values[0], "10 % of labels"
+    light = measured.values(task)[:, 0] + np.random.default_rng(0).normal(0, 9, measured.num)
+    pack = with_columns(measured, light=light)
+    pack.spec = replace(pack.spec, controls={"light": ("light",)})
+    found = {(r["source"], r["probe"]): r["r2"] for r in label_controls(pack, [task], (), ("linear", few_kind))}
+    assert found.keys() == {("mean", "linear"), ("light", "linear"), ("light", few_kind)}
+    assert found["light", few_kind] < found["light", "linear"] > 0.5
 
 
 def test_the_command_shows_few_labels(smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

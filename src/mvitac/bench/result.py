@@ -25,6 +25,7 @@ import numpy as np
 from mvitac.bench.external.adapters import parse
 from mvitac.bench.suite import Suite, SuiteSet, SuiteTask, find_suite, outdated, pinned, shipped
 from mvitac.data.spec import MODALITIES
+from mvitac.datasets.table.columns import value_task
 from mvitac.evaluation import few_labels
 from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.leaks import declared_leak
@@ -146,8 +147,8 @@ def pinned_of(suite: Suite, block: dict[str, Any]) -> str:
 def problems(value: dict[str, Any]) -> list[str]:
     """What is missing in a result, or cannot be, in one line each: tasks, scores, controls, sums, data."""
     suite, encoder = suite_of(value), value["encoder"]
-    found = list(problems_of(encoder, (*CONTROLS, GUESS)))
-    found += unknown_fields(value, [(value, (*FIELDS, "blocks")), *((block, BLOCK) for block in value["blocks"])])
+    found = [*unknown_fields(value, [(value, (*FIELDS, "blocks")), *((block, BLOCK) for block in value["blocks"])])]
+    found += problems_of(encoder, (*CONTROLS, GUESS))
     several: dict[tuple[str, int | None], list[Any]] = {}
     for records in (block.get("records", ()) for block in value["blocks"]):
         # Seeds may well have the same sums where they know everything, or nothing.
@@ -232,6 +233,12 @@ def problems_of(encoder: dict[str, Any], controls: Sequence[str]) -> Iterator[st
         yield "a digest of weights is none"
     if not len(seeds) == len(set(seeds)) == len(set(weights)) == len(weights):
         yield f"has {len(set(weights))} weights for seeds {seeds}"
+    if network := encoder.get("external"):
+        told = [[network.get("seed")], [network.get("weights")], network.get("encoders", {}).keys()]
+        if told != [seeds, weights, encoder["parameters"].keys()]:
+            yield "its network is of other seeds, weights or senses"
+    elif encoder.get("features", {}).keys() != encoder["parameters"].keys():
+        yield "its features and parameters are of other senses"
 
 
 def _of_block(
@@ -271,10 +278,30 @@ def _of_block(
         scored = [record.get("targets"), *(record["sums"][name] for name in ABOUT_ROWS if name in record["sums"])]
         if rows.setdefault(record["modality"], scored) != scored:
             yield f"{what}: is scored on other rows than those above it"
-    for own, other in itertools.product(*([r for r in records if bool(r["source"]) is of] for of in (False, True))):
-        known = other["source"] in ("pixels", "border") or own.get("clipped") != other.get("clipped")
-        if "targets" in own and known and own["modality"] == other["modality"] and own["sums"] == other["sums"]:
-            yield f"{own['modality']}, the encoder, {own['probe']}, seed {own['seed']}: has the sums of {other['source']}"
+    yield from _copies([record for record in records if "targets" in record])
+    asked = [
+        value_task(text) for form in one.forms if form.name == block["form"] for text in form.data.get("values", ())
+    ]
+    for task in (task for task in asked if task.name == block["task"] and records):
+        if records[0].get("targets") != (named := [[target.name, target.unit] for target in task.targets]):
+            yield f"its values are {records[0].get('targets')}, those of the suite {named}"
+
+
+def _copies(records: Sequence[dict[str, Any]]) -> Iterator[str]:
+    """Values that other features cannot give: sums have ten digits. An encoder may be a control's network."""
+    mean = [record["sums"] for record in records if record["source"] == "mean"]  # all that constant features give
+    for one, other in itertools.combinations([r for r in records if r["modality"] != "none"], 2):
+        fixed = {one["source"], other["source"]} & {"pixels", "border"} or (one["source"] and other["source"])
+        apart = one["source"] != other["source"] or (one["source"] and one["seed"] != other["seed"])
+        same = one["modality"] == other["modality"] and one["sums"] == other["sums"] and one["sums"] not in mean
+        if same and apart and (fixed or one.get("clipped") != other.get("clipped")):
+            names = [
+                f"{r['modality']}, {r['source'] or 'the encoder'}, {r['probe']}, seed {r['seed']}" for r in (one, other)
+            ]
+            yield f"{names[0]}: has the sums of {names[1]}"
+    for record in records:
+        if record["source"] in ("pixels", "untrained", "imagenet") and record["sums"] in mean:
+            yield f"{record['modality']}, {record['source']}, seed {record['seed']}: has the sums of mean"
 
 
 Key = tuple[str, str, str, int | None]  # source ("" is the encoder), modality, probe, seed
@@ -314,6 +341,9 @@ def _impossible(record: dict[str, Any], num_groups: int, folds: int) -> str:
     n = sums["n"] = np.atleast_2d(sums["n"])
     if any(np.atleast_2d(each).shape != n.shape for each in sums.values()) or n.shape[1] > num_groups:
         return f"its sums are not of {num_groups} groups"
+    texts = [text for target in record.get("targets", ()) for text in target]
+    if len(texts) != 2 * len(record.get("targets", ())) or not all(isinstance(text, str) for text in texts):
+        return f"its targets are {record['targets']}, not names and units"
     if "targets" in record and len(record["targets"]) != len(n):
         return f"it has sums of {len(n)} targets, and names of {len(record['targets'])}"
     whole = n if "targets" in record else np.stack([n, np.atleast_2d(sums["correct"])])

@@ -86,8 +86,14 @@ def compare(argv: list[str]) -> None:
     options = parse(_Options, rest, "compare", default=usual, description=manual)
     pick_device(options.device)
     same = {name: getattr(options, name) for name in ("data", *_SAME)}
-    changes = {**plan.set, **dict(setting(text) for text in options.set)}
-    plan = replace(plan.only(options.rows), recipe=recipe, set=changes, **same)
+    given = [setting(text) for text in options.set]
+    if twice := [name for i, (name, _) in enumerate(given) if name in dict(given[:i])]:
+        raise ValueError(f"--set {twice[0]} is given twice: give it once")
+    changes = {**plan.set, **dict(given)}
+    plan = plan.only(options.rows)
+    if "--recipe" in chosen and all(row.recipe for row in plan.rows):
+        raise ValueError(f"--recipe {recipe} has no effect: every row of {plan.name} has its own")
+    plan = replace(plan, recipe=recipe, set=changes, **same)
     config = ProbeConfig(probes=plan.probes, tasks=plan.tasks, modalities=plan.modalities)
     if options.dry_run and options.tables_only:
         raise ValueError("--tables-only has no effect beside --dry-run: leave one out")

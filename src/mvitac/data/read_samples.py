@@ -3,12 +3,15 @@
 import multiprocessing
 import os
 import pickle
+import signal
 import tempfile
+import threading
 import zlib
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -119,7 +122,8 @@ def read_parts(
         file.flush()
         try:
             for part in parts:
-                ahead.append(pool.submit(_read_here, *part))
+                with held_interrupt():  # the first one starts the processes
+                    ahead.append(pool.submit(_read_here, *part))
                 if len(ahead) > 2 * workers:  # more would only fill the memory
                     yield ahead.popleft().result()
             while ahead:
@@ -140,8 +144,29 @@ def one_thread() -> None:
 _reader: Reader  # of this worker process
 
 
+@contextmanager
+def held_interrupt() -> Iterator[None]:
+    """Hold Ctrl-C back, also in processes that are started inside, until they want it."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+def _end_with_parent() -> None:
+    """A parent that was killed takes no more results: its workers would wait for ever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
 def _start_worker(file: str) -> None:
     global _reader
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # ends without a traceback
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     keep_freed_memory()
     _reader = pickle.loads(Path(file).read_bytes())
     one_thread()

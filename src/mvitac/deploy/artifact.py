@@ -106,8 +106,8 @@ def read(folder: Path) -> Model:
         for name in ("colour_order", "mean", "std", "stored", "size", "channels", "window"):
             if given.get(name) != asked.get(name):
                 raise ValueError(f"{folder}: {name} is {given.get(name)}, its model was trained with {asked.get(name)}")
-        classes = from_json(tuple[ProbeInfo, ...], about["probes"], "probes")
-        values = from_json(tuple[ValueInfo, ...], about["values"], "values")
+        classes = from_json(tuple[ProbeInfo, ...], about["probes"], f"{folder / ARTIFACT.name}: probes")
+        values = from_json(tuple[ValueInfo, ...], about["values"], f"{folder / ARTIFACT.name}: values")
         path = folder / "probes.safetensors"
         tensors = read_safetensors(path)[1] if classes or values else {}
         for info in (*classes, *values):

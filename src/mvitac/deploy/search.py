@@ -58,7 +58,7 @@ class Embeddings:
             raise ValueError(f"{file} is no table of mvitac embed: {brief(error)}") from None
         with fields_of(file):
             self.shared, self.pack, self.pack_digest = about["shared"], Path(about["pack"]), about["pack_digest"]
-            self.classes = from_json(dict[str, tuple[str, ...]], about["classes"], "classes")
+            self.classes = from_json(dict[str, tuple[str, ...]], about["classes"], f"{file}: classes")
             self.table.select(["id", "group", "row"])  # KeyError if one is missing
             columns = {m: self.table.column(m) for m in ("vision", "touch") if m in self.table.column_names}
             whole = all(column.type.list_size and not column.null_count for column in columns.values())

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import MODALITIES, AnyTask, DataSpec, Task
+from mvitac.evaluation.few_labels import percent_of
 from mvitac.evaluation.probe import (
     names_in,
     probe_all,
@@ -114,7 +115,7 @@ def label_controls(
 ) -> Records:
     """What needs no image: the most common class or the mean value, and the dataset's own controls (table columns).
 
-    Where rows lack images, also on the rows of each of ``modalities``. Of values, a column gets one curve.
+    Where rows lack images, also on the rows of each of ``modalities``. Of values, a column gets a curve.
     """
     records = []
     for task, modality in [(t, m) for t in tasks for m in ("none", *seen_by(pack, t, modalities))]:
@@ -122,15 +123,17 @@ def label_controls(
         if modality != "none" and np.array_equal(rows.all, whole):
             continue
         if isinstance(task, Task):
+            guess, linear, kinds = "majority", "linear", probes_of(task, probes)
             answer = np.eye(len(task.classes))[np.bincount(pack.labels(task.name)[rows.fitted]).argmax()]
         else:
+            guess, linear, kinds = "mean", "curve", ["curve", *filter(percent_of, probes)]
             answer = np.nanmean(pack.values(task)[rows.fitted], axis=0)
-        guess, kinds = ("majority", probes_of(task, probes)) if isinstance(task, Task) else ("mean", ["curve"])
         found = [(guess, "linear", score_rows(pack, task, rows.test, np.tile(answer, (len(rows.test), 1))))]
         for name, columns in pack.spec.controls.items():
             x = np.stack([pack.column(column).astype(float) for column in columns], axis=1)
             if np.isfinite(x[whole]).all():  # else rows of a part of a mix that has no such control
-                found += [(name, k, probe_features(x[rows.all], pack, task, rows, k, 0)[0]) for k in kinds]
+                fit = partial(probe_features, x[rows.all], pack, task, rows, seed=0, few_kind=linear)
+                found += [(name, kind, fit(kind)[0]) for kind in kinds]
         for name, kind, result in found:
             known = {"task": task.name, "modality": modality, "probe": "linear" if kind == "curve" else kind}
             records += _named(name, None, [{**known, **result}])

@@ -14,7 +14,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import MODALITIES
 from mvitac.model import Model
 from mvitac.nn.folded import folded
-from mvitac.system.files import cache_dir, digest, write_atomic
+from mvitac.system.files import cache_dir, check_ordinary, digest, write_atomic
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.progress import work
 from mvitac.system.threads import in_threads
@@ -58,6 +58,7 @@ def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_h
         return features(model, pack, modality, every, for_heads=for_heads)[rows]
     path = _place(model, pack, modality, rows, for_heads=for_heads)
     if path.exists():
+        check_ordinary(path)  # a pipe never ends
         data = path.read_bytes()
         if hashlib.sha256(memoryview(data)[:-32]).digest() == data[-32:]:
             return np.load(io.BytesIO(data), allow_pickle=False)

@@ -117,16 +117,23 @@ def seen_by(pack: Pack, task: AnyTask, modalities: Sequence[str]) -> list[str]:
 
 
 def probe_features(
-    x: np.ndarray, pack: Pack, task: AnyTask, rows: ProbeSplit, kind: str, seed: int, paper: Classifier | None = None
+    x: np.ndarray,
+    pack: Pack,
+    task: AnyTask,
+    rows: ProbeSplit,
+    kind: str,
+    seed: int,
+    paper: Classifier | None = None,
+    few_kind: str = "linear",
 ) -> tuple[dict[str, Any], tuple[Fitted, np.ndarray]]:
-    """Fit a probe of ``kind`` on features ``x`` of ``rows.all``; ``paper`` is an already fitted one.
+    """Fit a probe of ``kind`` (``few_kind`` of few labels) on features ``x`` of ``rows.all``; ``paper`` is a fitted one.
 
     Returns its record, and the probe with what it predicts for the test rows.
     """
     if percent := percent_of(kind):
         train, val = few(pack, task, rows.train, rows.val, percent, seed)
         keep = np.concatenate([train, len(rows.train) + val, np.arange(len(rows.fitted), len(x))])
-        x, rows, kind = x[keep], ProbeSplit(rows.train[train], rows.val[val], rows.test), "linear"
+        x, rows, kind = x[keep], ProbeSplit(rows.train[train], rows.val[val], rows.test), few_kind
     num = len(rows.fitted)
     predict, extra = fit_probe(x[:num], pack, task, rows, kind, seed, paper)
     predicted = predict(x[num:])

@@ -32,7 +32,7 @@ class ProbeConfig:
     standardise: tuple[Standardise, ...] = ()
     """Statistics of each touch sensor (column sensor), from unlabelled images. features: standardise its features by
     their own mean and standard deviation. colours: show images of a sensor that --learn-on lacks in the colours of those
-    that it has, and take the mean features."""
+    that it has, and take the mean features. Retrieval stays as it is."""
 
     def __post_init__(self) -> None:
         given = {"probe": self.probes, "task": self.tasks, "modality": self.modalities, "standardise": self.standardise}
