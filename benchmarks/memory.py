@@ -22,7 +22,7 @@ from mvitac.methods.base import Views
 from mvitac.nn.encoders import SCRATCH, Encoders
 from mvitac.recipes import recipe
 from mvitac.training.step import Step
-from mvitac.transforms.random_views import ViewAugment, random_view
+from mvitac.transforms.random_views import ViewAugment, apply, draw
 
 
 def main() -> None:
@@ -40,8 +40,9 @@ def main() -> None:
 
     def views(number: int) -> Views:
         generator = torch.Generator().manual_seed(number)
-        view = partial(random_view, raw, ViewAugment(), given["size"], generator, torch.bfloat16)
-        images = {m: [view(), view()] for m in ("vision", "touch")}
+        drawn = [draw(ViewAugment(), part, 256, generator) for _ in range(4)]
+        made = [apply(raw, each, given["size"], torch.bfloat16) for each in drawn]
+        images = {"vision": made[:2], "touch": made[2:]}
         return Views(images=images, labels={}, rows=torch.arange(part, device=device))
 
     parts = [partial(views, number) for number in range(batch // part)]

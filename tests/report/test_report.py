@@ -29,7 +29,7 @@ from mvitac.experiments.table import lines_of
 from mvitac.experiments.table_formats import latex, markdown
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.report import figures
-from mvitac.report.galleries import nearest_rows, spread
+from mvitac.report.galleries import nearest_rows
 from mvitac.report.report import write_report
 from mvitac.report.tables import retrieval_rows
 from mvitac.run import Run
@@ -169,7 +169,6 @@ def test_a_mistake_is_nearest_to_another_class_by_touch_alone(tmp_path: Path) ->
     values = np.array([[1.0, 0.0], [0.9, 0.1], [5.0, 1.0], [0.0, 2.0]])  # lengths do not matter
     near = nearest_rows(values, np.array(["a", "a", "b", "c"]), 2)
     assert near.tolist() == [[2, 3], [2, 3], [1, 3], [2, 1]]  # one of each other group
-    assert spread(values, 9).tolist() == [2, 3, 0, 1]  # the most typical, then the farthest from those before
     run, _ = noise(tmp_path, Noise(vision=0))
     html = write_report([run], tmp_path / "out", quiet=True).read_text()
     assert "Not scored: it takes a space that both modalities share" in html

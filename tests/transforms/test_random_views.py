@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 
 from mvitac.transforms import random_views
-from mvitac.transforms.random_views import IMAGENET, Drawn, ViewAugment, draw, plain_view, random_view
+from mvitac.transforms.random_views import IMAGENET, Drawn, ViewAugment, apply, draw, plain_view
 
 
 def images(num: int = 8, channels: int = 3, side: int = 40) -> torch.Tensor:
@@ -67,12 +67,12 @@ def test_statistics_of_the_paper() -> None:
 
 
 def test_grayscale_makes_channels_equal_before_normalisation() -> None:
-    view = denormalise(random_view(images(), ViewAugment(grayscale=1.0), 24, generator()))
+    view = denormalise(apply(images(), draw(ViewAugment(grayscale=1.0), 8, 40, generator()), 24))
     torch.testing.assert_close(view[:, 0], view[:, 1], atol=1e-5, rtol=0)
     torch.testing.assert_close(view[:, 0], view[:, 2], atol=1e-5, rtol=0)
 
 
 def test_stacked_sensors_move_together() -> None:
     raw = images()
-    together = random_view(torch.cat([raw, raw], dim=1), ViewAugment(jitter=0.3), 24, generator())
+    together = apply(torch.cat([raw, raw], dim=1), draw(ViewAugment(jitter=0.3), 8, 40, generator()), 24)
     assert torch.equal(together[:, :3], together[:, 3:])

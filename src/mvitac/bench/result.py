@@ -368,14 +368,11 @@ def _impossible(record: dict[str, Any], num_groups: int, folds: int) -> str:
     wrong = (square < least * of).any() or (least * square > of)[n == 1].any()
     if record["source"] == "mean" and (n * squared < square - of - 1e-6 * square).any():  # one answer per group
         return "its errors are smaller than those of any one answer"
-    if record["source"] == "mean" and not folds and not _one_answer(n, squared, sums["value"], sums["squared_value"]):
-        return "its errors are not those of one answer"
+    if record["source"] == "mean" and not folds:  # its answer is a root of the sum of all groups, the last
+        value, middle = sums["value"], sums["value"][:, -1:] / n[:, -1:]
+        away = np.sqrt(np.maximum((squared - sums["squared_value"])[:, -1:] / n[:, -1:] + middle**2, 0))
+        made = np.array([sums["squared_value"] - 2 * c * value + n * c**2 for c in (middle - away, middle + away)])
+        near = abs(made - squared) <= 1e-4 * (sums["squared_value"] + n * (middle**2 + away**2))
+        if not near.all(2).any(0).all():
+            return "its errors are not those of one answer"
     return "its squares are not those of its values" if wrong else ""
-
-
-def _one_answer(n: np.ndarray, squared: np.ndarray, value: np.ndarray, square: np.ndarray) -> bool:
-    """Whether one answer of each target gives the squared errors of all groups; all are [T, G + 1], the last of all rows."""
-    mean = value[:, -1:] / n[:, -1:]
-    away = np.sqrt(np.maximum((squared - square)[:, -1:] / n[:, -1:] + mean**2, 0))
-    errors = np.array([abs(square - 2 * c * value + n * c**2 - squared) for c in (mean - away, mean + away)])
-    return bool((errors <= 1e-4 * (square + n * mean**2 + n * away**2)).all(2).any(0).all())

@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -122,8 +121,9 @@ def read_parts(
         file.flush()
         try:
             for part in parts:
-                with held_interrupt():  # the first one starts the processes
-                    ahead.append(pool.submit(_read_here, *part))
+                signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # also in processes that the first one starts
+                ahead.append(pool.submit(_read_here, *part))
+                signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
                 if len(ahead) > 2 * workers:  # more would only fill the memory
                     yield ahead.popleft().result()
             while ahead:
@@ -132,6 +132,7 @@ def read_parts(
             why = "out of memory, or a script without `if __name__ == '__main__':` (or give workers 1)"
             raise ValueError(f"a packing process died: {why}") from None
         finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # if the submission failed
             pool.shutdown(wait=True, cancel_futures=True)
 
 
@@ -142,16 +143,6 @@ def one_thread() -> None:
 
 
 _reader: Reader  # of this worker process
-
-
-@contextmanager
-def held_interrupt() -> Iterator[None]:
-    """Hold Ctrl-C back, also in processes that are started inside, until they want it."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def _end_with_parent() -> None:

@@ -89,9 +89,7 @@ def probe_runs(
     tasks, modalities = chosen(pack, session)
     _check_reads([*zip(names, models, strict=True), *((model.title, model) for model, _ in others)], pack, modalities)
     if session.standardise and (others or {*modalities} <= {"vision"}):
-        raise ValueError(
-            "--standardise changes the touch features of runs, not of vision or an --encoder: leave it out"
-        )
+        raise ValueError("--standardise changes the touch features of runs, not of vision or an --encoder")
     _check_names({*names}, {model.title for model, _ in others}, {*CONTROLS, *pack.spec.controls})
     for model in models:
         fitting(model, pack)

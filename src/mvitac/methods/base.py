@@ -4,7 +4,7 @@ Shapes: B images in a batch, V views of each image, C channels, H x W pixels, D 
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, fields
 from typing import ClassVar, Self
 
@@ -55,6 +55,11 @@ class Method(nn.Module, ABC):
 
     views: ClassVar[int] = 1
     """Views per image that ``forward`` needs."""
+
+    def __init_subclass__(cls, config: "type[MethodConfig] | None" = None) -> None:
+        """``config``: that by which the method is chosen, which builds it."""
+        if config:
+            config.method = cls
 
     def train(self, mode: bool = True) -> Self:
         super().train(mode)
@@ -114,9 +119,10 @@ class Contrastive(Method):
     towers: nn.ModuleDict
     """modality -> trunk and head (``build_towers``); a method that has others names its ``encoders`` itself."""
 
-    @abstractmethod
     def queries(self, batch: Views) -> Embeddings:
-        """Embeddings that receive gradients."""
+        """Embeddings that receive gradients; by default ("touch", 1) is the tower's of the second view of touch."""
+        images = batch.images
+        return {(m, i): tower(images[m][i]) for m, tower in present(self.towers, batch) for i in range(self.views)}
 
     def keys(self, batch: Views) -> Embeddings:
         """Tensors without gradients, e.g. embeddings of momentum encoders, or row numbers."""
@@ -159,6 +165,7 @@ def with_sum(losses: dict[str, Tensor]) -> dict[str, Tensor]:
 class MethodConfig(Registered, ABC):
     """Base of every method's config. A config is defined in the same file as its method."""
 
+    method: ClassVar[Callable[..., Method]]
     needs_pairs: ClassVar[bool] = False
     """Whether the method needs both modalities. If not, it also trains on vision or touch alone."""
     takes_missing: ClassVar[bool] = False
@@ -177,12 +184,6 @@ class MethodConfig(Registered, ABC):
         """The method on a trunk that is built in no time, to find out whether and how it works on the dataset."""
         trunk = "mvitac_tiny_vit" if self.needs_vit else "mvitac_tiny"
         return self.build(spec, encoder.changed(trunk=trunk, weights=SCRATCH))
-
-    def check_modalities(self, spec: DataSpec) -> None:
-        """Raise ValueError if the method ``needs_pairs`` and the dataset lacks a modality."""
-        if self.needs_pairs and len(spec.modalities) < 2:
-            only = f"dataset {spec.name!r} has {', '.join(spec.modalities)} only"
-            raise ValueError(f"method {self.name!r} learns from pairs, but {only}: choose another --method")
 
     @property
     def sensor_view(self) -> bool:
@@ -209,6 +210,9 @@ class MethodConfig(Registered, ABC):
         """This config with every setting that has no effect on the dataset at a fixed value."""
         return self
 
-    @abstractmethod
     def build(self, spec: DataSpec, encoder: Encoders) -> Method:
         """Create the method with fresh weights. Raises ValueError if it cannot work on the dataset."""
+        if self.needs_pairs and len(spec.modalities) < 2:
+            only = f"dataset {spec.name!r} has {', '.join(spec.modalities)} only"
+            raise ValueError(f"method {self.name!r} learns from pairs, but {only}: choose another --method")
+        return self.method(self, spec, encoder)

@@ -32,16 +32,13 @@ class BYOLConfig(MethodConfig):
     hidden: Fixed[int] = 1024
     """Hidden width of projector and predictor. Twice the trunk's width, as BYOL's 4096 is twice that of ResNet-50."""
 
-    def build(self, spec: DataSpec, encoder: Encoders) -> "BYOL":
-        return BYOL(self, spec, encoder)
-
 
 def regression(prediction: Float[Tensor, "B D"], target: Float[Tensor, "B D"]) -> Float[Tensor, ""]:
     """2 - 2 cos(prediction, target), mean over the batch (BYOL, eq. 2), in fp32."""
     return (2 - 2 * F.cosine_similarity(prediction.float(), target.float(), dim=1)).mean()
 
 
-class BYOL(Contrastive):
+class BYOL(Contrastive, config=BYOLConfig):
     """An online tower with a predictor, and a momentum tower, per modality."""
 
     views = 2
@@ -57,8 +54,8 @@ class BYOL(Contrastive):
         self.target = nn.ModuleDict({m: Momentum(tower) for m, tower in self.towers.items()})
 
     def queries(self, batch: Views) -> Embeddings:
-        z = {(m, i): online(batch.images[m][i]) for m, online in present(self.towers, batch) for i in (0, 1)}
-        return {("q", m, i): self.predictor[m](found) for (m, i), found in z.items()}
+        online = present(self.towers, batch)
+        return {("q", m, i): self.predictor[m](tower(batch.images[m][i])) for m, tower in online for i in (0, 1)}
 
     def keys(self, batch: Views) -> Embeddings:
         return {("k", m, i): target(batch.images[m][i]) for m, target in present(self.target, batch) for i in (0, 1)}

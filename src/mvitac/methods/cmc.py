@@ -54,10 +54,6 @@ class CMCConfig(MethodConfig):
     def negatives(self, num_rows: int) -> int:
         return min(self.num_negatives, max(1, int(NEGATIVES_PER_ROW * num_rows)))
 
-    def build(self, spec: DataSpec, encoder: Encoders) -> "CMC":
-        self.check_modalities(spec)
-        return CMC(self, spec, encoder)
-
 
 def nce(scores: Float[Tensor, "B _"], noise: float) -> Float[Tensor, ""]:
     """NCE loss of normalised scores s, whose column 0 is the positive's. ``noise`` is K / N: K times the uniform density."""
@@ -67,7 +63,7 @@ def nce(scores: Float[Tensor, "B _"], noise: float) -> Float[Tensor, ""]:
     return -(accepted + rejected.sum(1)).mean()
 
 
-class CMC(Contrastive):
+class CMC(Contrastive, config=CMCConfig):
     """A tower and a bank per modality."""
 
     rows: Tensor

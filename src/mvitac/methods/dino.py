@@ -53,9 +53,6 @@ class DINOConfig(MethodConfig):
     hidden: Fixed[int] = 2048
     """Hidden width of the 3-layer head (DINO: 2048 for every trunk)."""
 
-    def build(self, spec: DataSpec, encoder: Encoders) -> "DINO":
-        return DINO(self, spec, encoder)
-
 
 class Prototypes(nn.Module):
     """An MLP with a bottleneck: features [B, D] to cosines [B, K] with K learned directions."""
@@ -76,7 +73,7 @@ def agreement(student: Float[Tensor, "B K"], teacher: Float[Tensor, "B K"]) -> F
     return -(teacher.softmax(dim=1) * student.log_softmax(dim=1)).sum(1).mean()
 
 
-class DINO(Contrastive):
+class DINO(Contrastive, config=DINOConfig):
     """A student tower, its momentum copy (the teacher) and a centre per modality."""
 
     views = 2

@@ -60,9 +60,6 @@ class IJEPAConfig(MethodConfig):
         if not 0 < self.target_scale[0] <= self.target_scale[1] <= 1:
             raise ValueError(f"target_scale {self.target_scale}: give two rising numbers above 0, at most 1")
 
-    def build(self, spec: DataSpec, encoder: Encoders) -> "IJEPA":
-        return IJEPA(self, spec, encoder)
-
 
 @dataclass(frozen=True)
 class Blocks:
@@ -122,7 +119,7 @@ def multi_block(config: IJEPAConfig, seed: Tensor, rows: Tensor, stream: int, gr
     return Blocks(order, in_context, targets, (offset < side).all(1).expand_as(targets))
 
 
-class IJEPA(Contrastive):
+class IJEPA(Contrastive, config=IJEPAConfig):
     """A ViT, its momentum copy (the teacher) and a predictor per modality: half as wide and deep, at most 384 and 12."""
 
     def __init__(self, config: IJEPAConfig, spec: DataSpec, encoder: Encoders) -> None:

@@ -43,9 +43,6 @@ class MAEConfig(MethodConfig):
     pixel_norm: bool = True
     """Predict each patch minus its mean and over its standard deviation (MAE, T3). Sparsh and AnyTouch: off."""
 
-    def build(self, spec: DataSpec, encoder: Encoders) -> "MAE":
-        return MAE(self, spec, encoder)
-
 
 def split_patches(noise: Float[Tensor, "B N"], mask_ratio: float) -> tuple[Int[Tensor, "B K"], Int[Tensor, "B N-K"]]:
     """The patches with the least noise, K = int(N (1 - mask_ratio)) of them, and the others; one at least of each."""
@@ -54,7 +51,7 @@ def split_patches(noise: Float[Tensor, "B N"], mask_ratio: float) -> tuple[Int[T
     return order[:, :visible], order[:, visible:]
 
 
-class MAE(Contrastive):
+class MAE(Contrastive, config=MAEConfig):
     """A ViT and a decoder per modality. Width and depth of a decoder are two thirds of the trunk's, at most 512 and 8."""
 
     def __init__(self, config: MAEConfig, spec: DataSpec, encoder: Encoders) -> None:

@@ -43,10 +43,6 @@ class MCTConfig(QueueConfig):
     lambda_inter: float = 1.0
     """Weight of the two inter-modal losses."""
 
-    def build(self, spec: DataSpec, encoder: Encoders) -> "MCT":
-        self.check_modalities(spec)
-        return MCT(self, spec, encoder)
-
 
 def hinge(
     query: Float[Tensor, "B D"], key: Float[Tensor, "B D"], queue: Float[Tensor, "K D"], margin: float
@@ -57,7 +53,7 @@ def hinge(
         return F.relu(margin - (query * key).sum(1, keepdim=True) + query @ queue.T).mean()
 
 
-class MCT(MViTac):
+class MCT(MViTac, config=MCTConfig):
     """MViTac's query and key towers, and a queue for each head of each modality."""
 
     def __init__(self, config: MCTConfig, spec: DataSpec, encoder: Encoders) -> None:

@@ -54,11 +54,8 @@ class MoCoConfig(QueueConfig):
     temperature: float = 0.2
     """Temperature tau (MoCo v2: .2)."""
 
-    def build(self, spec: DataSpec, encoder: Encoders) -> "MoCo":
-        return MoCo(self, spec, encoder)
 
-
-class MoCo(Contrastive):
+class MoCo(Contrastive, config=MoCoConfig):
     """A query tower, its momentum copy and a queue per modality."""
 
     views = 2

@@ -13,7 +13,7 @@ from torch import Tensor
 from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
-from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
+from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, with_sum
 from mvitac.nn.encoders import Encoders, Head, build_towers
 
 
@@ -33,9 +33,6 @@ class SimCLRConfig(MethodConfig):
     head_norm: Fixed[bool] = True
     """BatchNorm after the first layer of the head (as in the authors' code)."""
 
-    def build(self, spec: DataSpec, encoder: Encoders) -> "SimCLR":
-        return SimCLR(self, spec, encoder)
-
 
 def nt_xent(a: Float[Tensor, "B D"], b: Float[Tensor, "B D"], temperature: float) -> Float[Tensor, ""]:
     """NT-Xent (SimCLR, eq. 1), mean over all 2B views, in fp32. Row i of ``a`` and row i of ``b`` are views of one image."""
@@ -46,7 +43,7 @@ def nt_xent(a: Float[Tensor, "B D"], b: Float[Tensor, "B D"], temperature: float
         return F.cross_entropy(logits, torch.arange(len(z), device=z.device).roll(len(a)))
 
 
-class SimCLR(Contrastive):
+class SimCLR(Contrastive, config=SimCLRConfig):
     """A tower per modality."""
 
     views = 2
@@ -56,9 +53,6 @@ class SimCLR(Contrastive):
         self.config = config
         sizes = config.hidden, config.out
         self.towers = build_towers(encoder, spec, lambda width: Head(width, *sizes, norm=config.head_norm))
-
-    def queries(self, batch: Views) -> Embeddings:
-        return {(m, i): tower(batch.images[m][i]) for m, tower in present(self.towers, batch) for i in (0, 1)}
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         return with_sum({m: nt_xent(z[m, 0], z[m, 1], self.config.temperature) for m in self.towers if (m, 0) in z})

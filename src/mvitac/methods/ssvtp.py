@@ -33,12 +33,8 @@ class SSVTPConfig(MethodConfig):
     out: Fixed[int] = 128
     """Width of the embeddings (128 in MViTac's comparison, 8 in SSVTP)."""
 
-    def build(self, spec: DataSpec, encoder: Encoders) -> "SSVTP":
-        self.check_modalities(spec)
-        return SSVTP(self, spec, encoder)
 
-
-class SSVTP(Contrastive):
+class SSVTP(Contrastive, config=SSVTPConfig):
     """Two towers, one symmetric loss."""
 
     def __init__(self, config: SSVTPConfig, spec: DataSpec, encoder: Encoders) -> None:

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
-from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
+from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, with_sum
 from mvitac.nn.encoders import Encoders, build_towers
 
 
@@ -40,9 +40,6 @@ class VICRegConfig(MethodConfig):
     hidden: Fixed[int] = 2048
     """Width of the three expander layers. Four times the trunk's width, as VICReg's 8192 is four times that of ResNet-50."""
 
-    def build(self, spec: DataSpec, encoder: Encoders) -> "VICReg":
-        return VICReg(self, spec, encoder)
-
 
 def variance(z: Float[Tensor, "B D"]) -> Float[Tensor, ""]:
     """v(Z), eq. 1-2."""
@@ -56,7 +53,7 @@ def covariance(z: Float[Tensor, "B D"]) -> Float[Tensor, ""]:
     return (cov.square().sum() - cov.diagonal().square().sum()) / z.shape[1]
 
 
-class VICReg(Contrastive):
+class VICReg(Contrastive, config=VICRegConfig):
     """A tower with a 3-layer expander per modality."""
 
     views = 2
@@ -73,9 +70,6 @@ class VICReg(Contrastive):
             return nn.Sequential(*layers, nn.Linear(hidden, hidden, bias=False))
 
         self.towers = build_towers(encoder, spec, expander)
-
-    def queries(self, batch: Views) -> Embeddings:
-        return {(m, i): tower(batch.images[m][i]) for m, tower in present(self.towers, batch) for i in (0, 1)}
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         losses: dict[str, Tensor] = {}

@@ -25,17 +25,8 @@ def nearest_rows(values: np.ndarray, groups: np.ndarray, num: int = NUM_FOUND) -
     return np.take_along_axis(best, np.argsort(-found, axis=1, kind="stable")[:, :num], axis=1)  # the own group is last
 
 
-def spread(values: np.ndarray, num: int) -> np.ndarray:
-    """K-center greedy (arXiv:1708.00489) by cosine of ``values`` [N, D]: ``num`` of N rows, the most typical first."""
-    alike = unit(values) @ unit(values).T
-    chosen = [int(alike.sum(1).argmax())]
-    while len(chosen) < min(num, len(values)):
-        chosen.append(int(alike[chosen].max(0).argmin()))
-    return np.array(chosen)
-
-
 def mistakes(study: Study) -> list[Markup]:
-    """Random rows whose nearest row has another class, with the nearest; without any labels, rows to label first."""
+    """Random rows whose nearest row has another class, with the nearest; without any labels, random rows."""
     (split, shown), pack = study.rows(), study.pack
     known = bool((study.labels(np.arange(pack.num)) >= 0).any())
     rows = sample(retrieved_rows(pack, *SPLITS), NUM_ROWS)
@@ -45,10 +36,10 @@ def mistakes(study: Study) -> list[Markup]:
     halves, asked = [], np.isin(rows, shown)
     shared = [label for label in np.unique(labels) if len(np.unique(groups[labels == label])) > 1]
     for modality in pack.spec.modalities:
-        near = nearest_rows(values := features(study.runs[0].model, pack, modality, rows), groups, num)
+        near = nearest_rows(features(study.runs[0].model, pack, modality, rows), groups, num)
         wrong = asked & np.isin(labels, shared) & (labels >= 0) & (labels[near[:, :1]] != labels[:, None]).any(1)
         strips = []
-        for at in (sample(np.flatnonzero(wrong), NUM_QUERIES) if known else spread(values, NUM_QUERIES)).tolist():
+        for at in sample(np.flatnonzero(wrong if known else asked), NUM_QUERIES).tolist():
             kinds = ("" if labels[i] < 0 else "same class" if labels[i] == labels[at] else "other" for i in near[at])
             pairs = zip(rows[near[at]].tolist(), kinds, strict=True)
             cells = [_cell(study, modality, other, *_SHOWN[kind]) for other, kind in pairs]
@@ -56,12 +47,9 @@ def mistakes(study: Study) -> list[Markup]:
             strips.append(html.grid(cells, "query"))
         halves.append(html.card(f"{modality}: {wrong.sum()} of {len(shown)} rows" if known else modality, strips))
     by, name = pack.spec.group_by, study.runs[0].path.name
-    intro = f"Each row is the one least like all above it{', so label these first' * (not pack.spec.all_tasks)}."
-    if known:
-        which = f"whose nearest row of another {by} is of another {pack.spec.tasks[0].name}"
-        intro = f"{split.capitalize()} rows {which}, drawn at random (seed 0)."
-    intro += f" Left: the row. Then, best first, the nearest row of each of the {num} nearest other {by}s of any split,"
-    intro += f" by features of the same modality ({name})."
+    which = f" whose nearest row of another {by} is of another {pack.spec.tasks[0].name}" if known else ""
+    intro = f"{split.capitalize()} rows{which}, drawn at random (seed 0). Left: the row. Then, best first, the nearest row"
+    intro += f" of each of the {num} nearest other {by}s of any split, by features of the same modality ({name})."
     return [html.paragraph(intro), html.grid(halves, "queries")]
 
 

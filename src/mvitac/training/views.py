@@ -15,7 +15,7 @@ from mvitac.system.distributed import World
 from mvitac.training.loader import ImageLoader, prefetch, prefetch_cuda
 from mvitac.training.sampler import Batches, combine_seeds, draw_positives
 from mvitac.training.step import Chunk
-from mvitac.transforms.random_views import draw, random_view
+from mvitac.transforms.random_views import apply, draw
 
 
 class StepViews:
@@ -78,9 +78,11 @@ class StepViews:
                     draw(run.augment.of(m), len(own[id(source)]), pack.size, generator)
             load = self.locked[m].__getitem__ if m in self.locked else partial(self.images, m)
             fed = {name: load(source) for name, source in own.items()}
-            how = run.augment.of(m), run.augment.size_of(m), generator, dtype, run.encoder[m].mean_std
-            shown = [fed[id(source)] for source in sources[m]]
-            images[m] = shown if m in self.locked else [random_view(one, *how) for one in shown]
+            shown, how = [fed[id(source)] for source in sources[m]], (dtype, run.encoder[m].mean_std)
+            if m not in self.locked:
+                drawn = (draw(run.augment.of(m), len(one), pack.size, generator) for one in shown)
+                shown = [apply(one, each, run.augment.size_of(m), *how) for one, each in zip(shown, drawn, strict=True)]
+            images[m] = shown
         splits = run.method.label_splits
         labels = {t.name: torch.from_numpy(pack.labels(t.name, *splits)[rows]).to(to) for t in pack.spec.tasks}
         values = {task: value.to(to) for task, value in values_of(run, pack, rows).items()}

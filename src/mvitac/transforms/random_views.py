@@ -225,19 +225,6 @@ def _colour(sensors: Float[Tensor, "B N 3 S S"], drawn: Drawn) -> Float[Tensor, 
     return sensors
 
 
-def random_view(
-    images: UInt8[Tensor, "B C H W"],
-    config: ViewAugment,
-    size: int,
-    generator: torch.Generator,
-    dtype: torch.dtype = torch.float32,
-    mean_std: MeanStd = IMAGENET,
-) -> Float[Tensor, "B C S S"]:
-    """One random view of each image. All randomness comes from ``generator``, which is on the CPU."""
-    num, _, side, _ = images.shape
-    return apply(images, draw(config, num, side, generator), size, dtype, mean_std)
-
-
 def plain_view(images: UInt8[Tensor, "B C H W"], size: int, mean_std: MeanStd = IMAGENET) -> Float[Tensor, "B C S S"]:
     """Whole images resized to ``size`` and normalised, without randomness, for probes and predictions."""
     num, _, height, width = images.shape
