@@ -12,6 +12,7 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from scipy.stats import rankdata
 
 from mvitac.bench.result import GUESS, pinned_of, problems, read_result, records_of, suite_of
 from mvitac.bench.suite import SuiteTask
@@ -64,11 +65,11 @@ class Board:
     def encoders(self) -> list[str]:
         """Names of encoders by their mean rank over the rows that all of them have, the best one first."""
         common = [row for row in self.rows if all(name in row.cells for name in self.results)]
-        ranks = dict.fromkeys(self.results, 0)
+        ranks = dict.fromkeys(self.results, 0.0)
         for row in common:
-            for rank, name in enumerate(sorted(self.results, key=lambda n: -row.cells[n]["mean"])):
-                ranks[name] += rank
-        return sorted(self.results, key=lambda name: ranks[name])
+            each = rankdata([-row.cells[name]["mean"] for name in self.results])  # equals share their mean rank
+            ranks = {name: ranks[name] + rank for name, rank in zip(ranks, each, strict=True)}
+        return sorted(self.results, key=lambda name: (ranks[name], name))
 
 
 def write_board(files: Sequence[Path], out: Path) -> Path:

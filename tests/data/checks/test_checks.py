@@ -2,7 +2,6 @@
 
 import copy
 import json
-import math
 import re
 from dataclasses import dataclass, replace
 from functools import cache
@@ -89,7 +88,7 @@ class Presses(Source):
             # as its table wrote it: an empty cell is an unlabelled row, no number to repair
             "written label": {"material": "" if k == 9 else str(material)},
             "give-away": {"force": material + (obj * 7 + k * 5) % 11 / 10},
-            "in one class": {"force": columns["force"] if material == 1 else math.nan},
+            "in one class": {"force": str(columns["force"]) if material == 1 else ""},  # as its table wrote it
             "few labels": {"label_material": material if k < 3 else -1},
             "another name": {"number": 7 - material},
         }

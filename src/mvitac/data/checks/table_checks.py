@@ -167,9 +167,10 @@ def _is_label(values: np.ndarray, labels: np.ndarray) -> bool:
 
 
 def _numbers(cells: np.ndarray) -> np.ndarray | None:
-    """Return cells as floats; None if one is no number. 20220319_002026 is a name, although Python reads it as one."""
+    """Return cells as floats, NaN if empty; None if one is no number. 20220319_002026 is a name, though Python reads one."""
     try:
-        return np.array([float("" if "_" in str(cell) else cell) for cell in cells])
+        texts = ("nan" if cell is None or cell == "" else str(cell) for cell in cells)
+        return np.array([float("" if "_" in text else text) for text in texts])
     except (TypeError, ValueError):
         return None
 
