@@ -244,6 +244,8 @@ def test_a_model_that_saw_the_test_groups_is_marked_and_not_ordered(results: lis
     assert blocks[0]["leaks"] == [""] and "72 of 120 test rows and 36 of 60 test instances" in blocks[2]["leaks"][0]
     board = gather(read)
     leaked, clean = list(read)
+    alike = [(name, read[clean]) for name in ("one", "two")]
+    assert gather(dict(alike)).encoders == gather(dict(alike[::-1])).encoders == ["one", "two"]
     text = {row.task: order_of(row, board.encoders) for row in board.rows}
     assert text["folded: pattern"].endswith(f"not ordered because of LEAK: {leaked}")
     other = read | {clean: {**read[clean], "blocks": [{**b, "form": "clone"} for b in read[clean]["blocks"]]}}

@@ -127,8 +127,7 @@ def give_aways(pack: Pack) -> Finding:
     """Find columns of numbers, and sensors, that predict a label: confounds that a control probe should use.
 
     On the labelled rows outside test, the accuracy of the most frequent class in each eighth of the values (of each
-    sensor) is compared with that of the majority class; empty cells are a part of their own. A control is skipped, and a
-    column that is the label itself is only named.
+    sensor, of empty cells) is compared with that of the majority class. Controls are skipped, the label itself is named.
     """
     notes, same, few = [], [], []
     other = {"id", *(task.name for task in pack.spec.tasks), *(c for used in pack.spec.controls.values() for c in used)}
@@ -144,7 +143,7 @@ def give_aways(pack: Pack) -> Finding:
                 notes += _predicts("sensor", task.name, pack.sensors[rows], found)
                 continue
             mine = _numbers(pack.column(name)[rows])
-            if mine is None or len(np.unique(mine)) < 2:
+            if mine is None or not np.isfinite(mine).any() or len(np.unique(mine)) < 2:
                 continue
             if _is_label(mine, found):
                 same.append(f"{name} says the same as {task.name}")
