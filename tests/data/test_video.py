@@ -11,7 +11,7 @@ from PIL import Image
 
 from mvitac.data import video
 from mvitac.data.video import frames, num_frames
-from support.videos import edited, numbered, read_number, write_video
+from support.videos import edited, film, numbered, read_number, write_video
 
 NUM = 150
 KINDS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -238,3 +238,12 @@ def test_files_that_are_no_videos(made: dict[str, Path], tmp_path: Path) -> None
             container.mux(packet)
     with pytest.raises(ValueError, match="holds no video"):
         num_frames(tmp_path / "sound.mp4")
+
+
+def test_a_playlist_is_no_video(tmp_path: Path) -> None:
+    """It would show files elsewhere, itself without end, and other frames than the cache knows."""
+    film(tmp_path / "a.mp4", 5)
+    (tmp_path / "list.mp4").write_text("ffconcat version 1.0\nfile a.mp4\n")
+    assert num_frames(tmp_path / "a.mp4") == 5
+    with pytest.raises(ValueError, match=r"list\.mp4 cannot be read as a video"):
+        num_frames(tmp_path / "list.mp4")

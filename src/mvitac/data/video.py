@@ -29,6 +29,7 @@ from av.video.stream import VideoStream
 from mvitac.system.files import brief
 
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg")
+FORMATS = "mov,mp4,avi,matroska,webm,mpeg,mpegvideo,mpegts,m4v"  # no playlists, which may name any other file
 
 
 class Packets(NamedTuple):
@@ -198,7 +199,7 @@ def _opened(path: str | Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     if Path(path).exists() and not Path(path).is_file():
         raise ValueError(f"{path} is no file: a pipe would be waited for for ever")
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path), options={"format_whitelist": FORMATS}) as container:
             if not container.streams.video or not container.streams.video[0].codec_context:  # None: no such codec
                 raise ValueError(f"{path} holds no video that can be decoded: give another file")
             stream = container.streams.video[0]

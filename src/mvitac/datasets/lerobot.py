@@ -173,7 +173,9 @@ def _info(root: Path) -> dict[str, Any]:
     version = str(info.get("codebase_version")) if isinstance(info, dict) else "none"
     if not version.startswith(("v2.", "v3.")):
         raise ValueError(f"{root} has LeRobotDataset version {version}: v2 and v3 are read")
-    if not isinstance(info.get("features"), dict) or not all("dtype" in f for f in info["features"].values()):
+    if not isinstance(info.get("features"), dict) or not all(
+        isinstance(f, dict) and "dtype" in f for f in info["features"].values()
+    ):
         raise ValueError(f"{root / 'meta/info.json'} lists no features: fetch it again")
     return info
 
