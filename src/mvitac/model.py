@@ -210,8 +210,7 @@ class Model(nn.Module):
                 ``touch`` must already be (touch - background) / 2 + 128.
             shared: Return embeddings in the space shared by both modalities, L2-normalised, instead of features.
 
-        Returns modality -> [N, D], or [N, E] with ``shared``; ValueError if images do not fit the model, or it is in
-        training mode.
+        Returns modality -> [N, D], or [N, E] with ``shared``; ValueError in training mode, or if images do not fit.
 
         Examples:
             >>> model.embed(touch=np.zeros((4, 240, 320, 3), np.uint8))["touch"].shape  # doctest: +SKIP

@@ -178,8 +178,7 @@ def recipe(name: str, data: DatasetConfig | Pack | None = None, phased: bool | N
         name: One of ``RECIPES``: paper, authors, modern, quick, locked, smoke.
         data: Dataset to train on, or an open pack. Default: simulated touches of materials, as in `mvitac demo`.
         phased: Whether rows of a touch group show the phases of a grasp. They are then not each other's positives, and
-            views are not grayscale. Default: what the data says (``Pack.phased``); datasets that do not know it
-            beforehand are opened.
+            views are not grayscale. Default: what the data says (``Pack.phased``), opened if needed.
 
     Raises:
         ValueError: If there is no such recipe.

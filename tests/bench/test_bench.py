@@ -17,9 +17,10 @@ import torch
 
 from mvitac.bench import score, suite
 from mvitac.bench.board import _page, gather, order_of, write_board
+from mvitac.bench.check import problems
 from mvitac.bench.encoder import About, describe, run_bench
 from mvitac.bench.external import open_model
-from mvitac.bench.result import FORMAT, VOLATILE, pinned_of, problems, read_result, records_of, suite_of
+from mvitac.bench.result import FORMAT, VOLATILE, pinned_of, read_result, records_of, suite_of
 from mvitac.bench.score import Reader, misfit
 from mvitac.bench.suite import find_suite, open_set, shipped
 from mvitac.cli.main import main
@@ -397,6 +398,9 @@ FORGED: dict[str, tuple[Change, str]] = {
     "a control knows nothing": (partial(copied, "untrained", "mean"), "untrained, seed 0: has the sums of mean"),
     "no unit": (put(*VALUES, "targets", value=[["light"]]), "not names and units"),
     "other seed": (put("encoder", "external", value={"seed": 9}), "its network is of other seeds, weights or senses"),
+    "no licence": (lambda value: value["encoder"].pop("licence"), r"a\.json is damaged: .*'licence'"),
+    "leaks by name": (put("blocks", 0, "leaks", value={"a": 1}), "a leak mark, a note, a group or what"),
+    "rows in floats": (put(*RECORDS, 0, "sums", "n", 0, value=float), "its sums are no numbers"),
     "no features": (put("encoder", "features", value={}), "its features and parameters are of other senses"),
     "unit of the suite": (own_values, r"its values are .*, those of the suite \[\['lumen', 'lm'\]\]"),
     "errors in another unit": (other_unit, "its errors are smaller than those of any one answer"),

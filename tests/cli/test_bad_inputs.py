@@ -140,6 +140,8 @@ WORDS: list[tuple[str, str, str]] = [
     (PRETRAIN, "--data.frames-of both", "--data.frames-of is for rows of several frames"),
     (PRETRAIN, "--data.order press --data.minus-first --data.stride 2", "--data.stride is for rows of several frames"),
     ("data pack --data materials --num 20 --out ", ".", ". already exists: choose another --out"),
+    ("predict e ", "g.mp4 --out a.parquet", "--out a.parquet: the table is CSV"),
+    ("live e --record {out} ", "--json {out}/pack.json", "is the place of another output, or inside it"),
     ("compare --dry-run ", "--set steps=3 steps=5", "--set steps is given twice"),
     ("compare --plan recipes --dry-run ", "--recipe smoke", "--recipe smoke has no effect: every row of recipes has"),
     ("probe {run} ", "{run}", "twice"),
@@ -402,6 +404,8 @@ def test_an_output_that_is_an_input(refused: Callable[..., str], finished: Path,
     for name in ("model.safetensors", "run.json"):
         refused(f"probe {finished} --json {finished / name}", "may be what the command reads")
     refused(f"bench board {finished}/run.json --out {finished}/run.json", "may be what the command reads")
+    (tmp_path / "mine").touch()
+    refused(f"report {finished} --out {tmp_path}/mine", "mine is a file: give a folder")
     (finished / "policy.py").touch()
     (finished / "frames").mkdir(exist_ok=True)
     (frame := finished / "frames" / "3.png").write_bytes(b"0")

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -244,9 +245,17 @@ def test_lerobot_says_when_there_is_less_than_was_recorded(tmp_path: Path) -> No
     changed(root, lambda row: row | {"task_index": 0}, "meta/tasks")
     with pytest.raises(ValueError, match="a task_index with two texts"):
         LeRobotConfig(path=root, labels=("kind",)).source()
-    pq.write_table(pa.table({"task_index": [0, 1]}), root / "meta/tasks.parquet")
-    with pytest.raises(ValueError, match=r"tasks\.parquet is damaged"):
-        LeRobotConfig(path=root, labels=("kind",)).source()
+    for texts in ({}, {"task": ["press", None]}):
+        pq.write_table(pa.table({"task_index": [0, 1], **texts}), root / "meta/tasks.parquet")
+        with pytest.raises(ValueError, match=r"tasks\.parquet is damaged"):
+            LeRobotConfig(path=root, labels=("kind",)).source()
+
+
+@pytest.mark.parametrize("name", ["a.parquet", "a.h5"])
+def test_a_pipe_is_no_table(name: str, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / name)  # reading it would wait for ever
+    with pytest.raises(ValueError, match=f"{name} .*neither a file nor a folder"):
+        FolderConfig(path=tmp_path / name).source()
 
 
 @pytest.mark.parametrize(
@@ -342,6 +351,11 @@ def test_image_parquet_of_the_hub(tmp_path: Path) -> None:
         assert pack.column("group")[row] == f"t{i // 2}"
         assert pack.column("split")[row] == ("test" if i >= 20 else "train")
     assert len({level(image) for image in pack.images["touch"]}) == 30
+    for file in [*root.glob("*.parquet"), root / "13.png"]:  # as the Hub converts a dataset
+        os.renames(
+            file, root / (file.stem.split("-")[0] if "-" in file.stem else "train") / file.name.split("-", 1)[-1]
+        )
+    assert sorted(packed(config, tmp_path / "again").column("split")) == ["test"] * 10 + ["train"] * 20
 
 
 def test_a_table_shows_no_image_of_other_folders(tmp_path: Path) -> None:

@@ -14,7 +14,8 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from scipy.stats import rankdata
 
-from mvitac.bench.result import GUESS, pinned_of, problems, read_result, records_of, suite_of
+from mvitac.bench.check import GUESS, problems
+from mvitac.bench.result import pinned_of, read_result, records_of, suite_of
 from mvitac.bench.suite import SuiteTask
 from mvitac.evaluation import few_labels
 from mvitac.evaluation.intervals import paired_difference

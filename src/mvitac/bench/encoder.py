@@ -7,9 +7,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from mvitac.bench.check import GUESS, wrong_name
 from mvitac.bench.external import ExternalModel
 from mvitac.bench.external.adapters import NOTHING
-from mvitac.bench.result import FORM, GUESS, read_signed, sign, write_result, wrong_name
+from mvitac.bench.result import FORM, read_signed, sign, write_result
 from mvitac.bench.score import Entry, score_suite
 from mvitac.bench.suite import Suite
 from mvitac.deploy.artifact import load

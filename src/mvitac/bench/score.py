@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from mvitac.bench.check import NO_IMAGENET
 from mvitac.bench.external import ExternalModel, open_model
-from mvitac.bench.result import NO_IMAGENET, stored
+from mvitac.bench.result import stored
 from mvitac.bench.suite import Opened, Suite, SuiteSet, SuiteTask, open_set
 from mvitac.data.lazy import Changed
 from mvitac.data.pack import Pack

@@ -9,8 +9,9 @@ from tabulate import tabulate
 from tyro.conf import Positional
 
 from mvitac.bench.board import write_board
+from mvitac.bench.check import problems
 from mvitac.bench.encoder import About, run_bench
-from mvitac.bench.result import problems, read_result, records_of
+from mvitac.bench.result import read_result, records_of
 from mvitac.bench.suite import find_suite, shipped
 from mvitac.cli.options import check_json, parse
 from mvitac.control import result as loop

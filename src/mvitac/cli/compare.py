@@ -35,11 +35,9 @@ class _Options:
     """Cross-validation: the field of the data that makes each fold, e.g. --folds split=fold1 split=fold2. Test groups
     must differ between folds, and are pooled."""
     probes: tuple[Probe, ...]
-    """Probes that score the features: linear, paper, knn. The tables show the first; paper is the one of the paper's
-    numbers."""
+    """Probes that score the features: linear, paper, knn. The tables show the first; the paper's numbers are of paper."""
     set: tuple[str, ...] = ()
-    """field=value for every row of the plan, e.g. --set steps=100 encoder.weights=scratch; a row's own values come
-    after."""
+    """field=value for every row of the plan, e.g. --set steps=100 encoder.weights=scratch; a row's own come after."""
     device: str = "auto"
     """auto, cpu, cuda or cuda:N. The same command given again meanwhile, on another GPU or on a machine that shares the
     folder, takes the runs that no process has."""

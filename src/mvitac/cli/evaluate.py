@@ -22,14 +22,12 @@ class _ProbeOptions:
     runs: Positional[tuple[Path, ...]] = ()
     """Folder of each finished run: seeds of one method, or several methods, on the same data."""
     encoder: tuple[str, ...] = ()
-    """Other people's encoders to probe on --on, e.g. external:timm/NAME or external:python:MODULE:FUNCTION
-    (docs/bench.md)."""
+    """Other people's encoders to probe on --on: external:timm/NAME, external:python:MODULE:FUNCTION (docs/bench.md)."""
     config: Annotated[ProbeConfig, tyro.conf.arg(name="")] = ProbeConfig()
     on: Path | None = None
     """Probe on this pack instead of the data the runs were trained on."""
     learn_on: Path | None = None
-    """Fit the probes on the train rows of this pack, and score them on the test rows of --on: transfer to a sensor
-    without labels."""
+    """Fit the probes on the train rows of this pack, score them on the test rows of --on: transfer without labels."""
     allow_leak: bool = False
     """Score a run also on rows or groups of --on that it was trained on. LEAK stands beside every such score."""
     per_class: bool = False
@@ -101,4 +99,6 @@ def report(argv: list[str]) -> None:
 
     alone = len(options.runs) == 1 and options.runs != (BASE,)  # nothing is written into the package
     out = options.out or (options.runs[0] / "report" if alone else Path("runs") / "report")
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"--out {out} is a file: give a folder")
     print(f"written: {write_report(options.runs, out, quiet=options.quiet)}")

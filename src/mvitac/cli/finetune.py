@@ -19,8 +19,7 @@ from mvitac.report.tables import print_finetuning
 @dataclass(frozen=True, kw_only=True)
 class _Options:
     model: Positional[Path]
-    """Folder of a finished run, or of an artifact; imagenet, or imagenet:TRUNK; or TRUNK=FILE, other weights of a trunk of
-    timm."""
+    """Folder of a finished run or an artifact; imagenet, imagenet:TRUNK, or TRUNK=FILE: weights of a trunk of timm."""
     data: DatasetConfig
     config: Annotated[Finetuning, tyro.conf.arg(name="")] = Finetuning()
     out: Path = Path("runs/finetuned")

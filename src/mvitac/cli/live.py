@@ -160,7 +160,7 @@ class _PredictOptions(_Common):
     source: Annotated[Positional[str | None], tyro.conf.arg(metavar="SOURCE")] = None
     """SOURCE, where the model takes one input; or other data: a pack, a table, a bag, whatever --data reads."""
     out: Path
-    """The table, a row for each frame."""
+    """The table (.csv), a row for each frame."""
 
 
 def predict(argv: list[str]) -> None:
@@ -169,6 +169,8 @@ def predict(argv: list[str]) -> None:
     if files and bool(options.source) == bool(options.vision or options.touch):
         raise ValueError("give one SOURCE, or those of --vision and --touch")
     check_json(options.out, "--out")
+    if options.out.suffix.lower() in (".parquet", ".jsonl", ".json", ".xlsx"):
+        raise ValueError(f"--out {options.out}: the table is CSV, give a name that ends in .csv")
     given = {"vision": (options.vision,) if options.vision else (), "touch": options.touch}
     opened = {m: [recording(text) for text in texts] for m, texts in given.items() if texts and files}
     single = [recording(options.source)] if options.source and files else []
@@ -240,8 +242,7 @@ def sources(
 ) -> dict[str, tuple[str, ...]]:
     """The sources by modality: those that were given, or simulated sensors if there are none.
 
-    ``inputs``: modality -> shape [S, S, C] of an input. ValueError if only some have a source: a simulated sensor must
-    not pass for a real one.
+    ``inputs``: modality -> shape [S, S, C] of an input. ValueError if only some have a source: none is simulated then.
     """
     given: dict[str, tuple[str, ...]] = {"vision": (vision,) if vision else (), "touch": tuple(touch)}
     given = {modality: texts for modality, texts in given.items() if texts}

@@ -141,8 +141,8 @@ def _check_outputs(words: Sequence[str]) -> None:
     seen: set[Path] = set()
     for i, option in outputs.items():
         file = Path(os.path.realpath(places[i]))
-        if file in seen:
-            raise ValueError(f"{option} {places[i]} is the place of another output: give another")
+        if any(one == file or one in file.parents or file in one.parents for one in seen):
+            raise ValueError(f"{option} {places[i]} is the place of another output, or inside it: give another")
         seen.add(file)
         if not file.is_file():
             continue

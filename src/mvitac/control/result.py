@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from mvitac.bench.check import FIELDS, are_digests, problems_of, unknown_fields
 from mvitac.bench.encoder import About, measure
-from mvitac.bench.result import FIELDS, are_digests, problems_of, read_signed, unknown_fields
+from mvitac.bench.result import read_signed
 from mvitac.bench.score import kept_part
 from mvitac.control.ablate import suite_episodes
 from mvitac.control.insert import Insert

@@ -35,7 +35,7 @@ from mvitac.datasets.table.manifest import Manifest, Row
 from mvitac.datasets.table.parquet import Refs, add_file
 from mvitac.datasets.table.table import RecordedConfig
 from mvitac.registry import unknown
-from mvitac.system.files import brief, fields_of, parse_json, read_json
+from mvitac.system.files import brief, check_ordinary, fields_of, parse_json, read_json
 
 FELT = re.compile(r"touch|tactile|gelsight|digit(?!al)|gel\b|finger", re.IGNORECASE)  # usual names of tactile cameras
 RENAMED = {"episode_index": "episode", "frame_index": "frame", "index": "id"}
@@ -219,6 +219,7 @@ def _tasks(root: Path, info: dict[str, Any]) -> dict[str, str]:
     file = root / "meta" / ("tasks.parquet" if _is_new(info) else "tasks.jsonl")
     with fields_of(file):
         pairs = [(str(row.pop("task_index")), row.popitem()[1]) for row in (_rows(file) if file.is_file() else [])]
+        assert all(isinstance(text, str) for _, text in pairs), "a task that is no text"
     if len(tasks := dict(pairs)) < len({*pairs}):
         raise ValueError(f"{file} has a task_index with two texts: fetch it again")
     return tasks
@@ -232,6 +233,7 @@ def _rows(path: Path, begins: tuple[str, ...] = ("",)) -> list[dict[str, Any]]:
         except ValueError as error:
             raise ValueError(f"{path} cannot be read ({brief(error)}): fetch it again") from None
     try:
+        check_ordinary(path)
         table = pq.read_table(path)
     except (pa.ArrowException, OSError) as error:
         raise ValueError(f"{path} cannot be read ({brief(error)}): fetch the whole dataset") from None

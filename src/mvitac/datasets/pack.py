@@ -21,8 +21,7 @@ class PackConfig(DatasetConfig):
     """The pack's folder."""
 
     score_on: Literal["test", "val"] = "test"
-    """val: use split val as the test split and hide test, to choose a recipe by `mvitac compare` without its test
-    scores."""
+    """val: use split val as the test split and hide test, to choose a recipe by `mvitac compare` without it."""
 
     @classmethod
     def reads(cls, path: Path) -> bool:

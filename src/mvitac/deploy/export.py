@@ -32,8 +32,7 @@ from mvitac.system.provenance import provenance
 
 NEW_SENSOR = "--new-sensor"  # the option that errors name
 NUM_CALIBRATION, NUM_CHECK = 128, 16
-"""Images that set the ranges of int8; images that an export carries for the check on the robot (int8 products saturate
-for some images only)."""
+"""Images that set the ranges of int8; images for the check on the robot (int8 products saturate for some images only)."""
 
 
 def export(

@@ -83,8 +83,7 @@ class Embeddings:
     ) -> tuple[np.ndarray, np.ndarray]:
         """The ``k`` nearest images of modality ``target`` to ``images`` of modality ``source``.
 
-        ``images`` [Q] and ``background`` are as for ``Model.embed``. Returns numbers of rows of the file and cosines,
-        both [Q, k], best first.
+        ``images`` [Q], ``background``: as for ``Model.embed``. Returns rows of the file and cosines [Q, k], best first.
         """
         if k < 1:
             raise ValueError(f"num {k}: give 1 or more")

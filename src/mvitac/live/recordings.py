@@ -1,8 +1,7 @@
 """Predict from recordings: every frame of videos, folders of pictures or a pack, in batches, as ``Live`` would see it.
 
 A table is a dict of columns: ``frame`` (its number) and ``time`` [s]; ``contact`` and ``touch`` (number of touches so
-far), if the sensor was seen without contact; of a pack ``id``, ``group`` and ``split``; and for each task those of
-``answers``.
+far), if the sensor was seen without contact; of a pack ``id``, ``group``, ``split``; and those of ``answers``.
 """
 
 from collections.abc import Iterator, Sequence

@@ -111,7 +111,7 @@ class Method(nn.Module, ABC):
 class Contrastive(Method):
     """A method whose losses use only tensors that are computed separately for each pair.
 
-    It implements ``queries`` and ``contrast`` instead of ``forward``, and may add ``keys``. The training step can then
+    It implements ``contrast`` instead of ``forward``, and may add ``queries`` and ``keys``. The training step can then
     embed a batch in chunks (gradient caching) or on several processes (all-gathered negatives), and compute the loss over
     all of it (``training/step.py``).
     """
@@ -166,6 +166,7 @@ class MethodConfig(Registered, ABC):
     """Base of every method's config. A config is defined in the same file as its method."""
 
     method: ClassVar[Callable[..., Method]]
+    """The class that ``build`` makes, which names this config: ``class MoCo(Contrastive, config=MoCoConfig)``."""
     needs_pairs: ClassVar[bool] = False
     """Whether the method needs both modalities. If not, it also trains on vision or touch alone."""
     takes_missing: ClassVar[bool] = False

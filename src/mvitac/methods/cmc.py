@@ -103,8 +103,7 @@ class CMC(Contrastive, config=CMCConfig):
     def _contrast(self, query: Tensor, bank: Bank, at: Tensor, fixed: Tensor) -> tuple[Tensor, Tensor]:
         """The loss of one direction, and its normalisation constant Z, for embeddings ``query`` [B, D].
 
-        ``at`` [B, K + 1] are rows of ``bank``, the other modality's; column 0 is the positive. ``fixed`` is Z of earlier
-        batches, 0 in the first.
+        ``at`` [B, K + 1] are rows of ``bank``, the other modality's; column 0 is the positive. ``fixed``: Z of earlier ones.
         """
         logits = bank.dots(query, at) / self.config.temperature
         if self.config.softmax:

@@ -9,8 +9,7 @@ The variance is the unbiased one (P - 1), as in the authors' code; Sparsh predic
 The frames of a window are channels: a patch spans all of them, so that masks are tubes (VideoMAE, Tong et al.,
 arXiv:2203.12602, with one tubelet).
 Sources: the paper (section 3, appendix A); facts of https://github.com/facebookresearch/mae (models_mae.py).
-Not implemented: the authors' optimiser (the recipe's, for all methods), and fixed positions in the encoder (here the
-trunk's own).
+Not implemented: the authors' optimiser (the recipe's, for all methods), and fixed positions (here the trunk's own).
 
 Shapes: B images, N patches of P values (pixels x channels), K of them visible, D features.
 """

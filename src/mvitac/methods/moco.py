@@ -29,8 +29,7 @@ class QueueConfig(MethodConfig, ABC):
     """Fields shared by the methods with a queue (moco, mct)."""
 
     queue: int = 4096
-    """Number of keys K in each queue. MoCo's 65,536 are 5 % of ImageNet; 4,096 are 5 % of Touch and Go. At most one for
-    eight training rows."""
+    """Number of keys K in each queue: 5 % of Touch and Go, as MoCo's 65,536 are of ImageNet. At most one for eight rows."""
     momentum: float = 0.999
     """Momentum m of the key towers (MoCo: .999)."""
     out: Fixed[int] = 128

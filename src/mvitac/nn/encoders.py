@@ -106,8 +106,7 @@ class EncoderConfig:
     """Start of a pretrained trunk's first convolution for images that do not have three channels: timm repeats and rescales
     its filters, or random (the authors' code)."""
     temporal: Literal["stack", "mean"] = "stack"
-    """How several frames of a window are read. stack: as channels of one image. mean: the trunk sees each frame, and their
-    features are averaged."""
+    """How several frames of a window are read. stack: as channels of one image. mean: each by itself, features averaged."""
     pool: Literal["last", "stages"] = "last"
     """Features of the trunk. last: its own, pooled after the last layer. stages: the means of the maps of all its stages,
     side by side; early ones keep texture that the last layer of a network from ImageNet has lost."""

@@ -129,8 +129,7 @@ class Predictor(nn.Module):
     """A narrow ViT that predicts something about hidden patches from visible ones (MAE's decoder, I-JEPA's predictor).
 
     A hidden patch is a learned mask token plus the fixed sine-cosine embedding of its position. ``out``: width of the
-    predictions. Its own width and number of blocks are ``share`` of the trunk's, in whole heads of 32 features, up to
-    ``most``.
+    predictions. Its width and number of blocks are ``share`` of the trunk's, in whole heads of 32, up to ``most``.
     """
 
     def __init__(self, trunk: nn.Module, out: int, share: float, most: tuple[int, int]) -> None:

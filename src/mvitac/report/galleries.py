@@ -48,10 +48,8 @@ def mistakes(study: Study) -> list[Markup]:
         halves.append(html.card(f"{modality}: {wrong.sum()} of {len(shown)} rows" if known else modality, strips))
     by, name = pack.spec.group_by, study.runs[0].path.name
     which = f" whose nearest row of another {by} is of another {pack.spec.tasks[0].name}" if known else ""
-    intro = (
-        f"{split.capitalize()} rows{which}, drawn at random (seed 0). Left: the row. Then, best first, the nearest row"
-    )
-    intro += f" of each of the {num} nearest other {by}s of any split, by features of the same modality ({name})."
+    intro = f"{split.capitalize()} rows{which}, drawn at random (seed 0). Left: the row. Then, best first, the nearest"
+    intro += f" row of each of the {num} nearest other {by}s of any split, by features of the same modality ({name})."
     return [html.paragraph(intro), html.grid(halves, "queries")]
 
 

@@ -45,8 +45,7 @@ def pressure(
     Args:
         relief_mm: Object height [H, W]; higher = nearer to the gel, -inf = no object.
         stiffness: Winkler modulus of the object in N/mm^3 (foam 0.01, wood above 10; 1e3 is rigid).
-        dome_radius_mm: Radius of the gel's dome; None = flat. Real gels are domed; a flat pad on a flat face gives a
-            nearly blank picture.
+        dome_radius_mm: Radius of the gel's dome; None = flat: on a flat face a nearly blank picture.
     """
     height = np.array(relief_mm, np.float64)
     if dome_radius_mm is not None:  # a domed gel touches first at its centre

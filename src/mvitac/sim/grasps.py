@@ -64,8 +64,7 @@ def grasp(
         ``success`` (0 or 1, equal in all phases), the names ``object`` and ``sensor``, and numbers: the inputs
         (``mass_kg``, ``friction``, ``force_n`` the set grip force, ``offset_mm`` from the centre of mass along the
         object, ``height_mm`` of the grip above it, ``yaw_deg``, ``peaks``, ``amplitude_mm``, ``softness``), the result
-        (``lift_mm``, ``unstable``) and the contact (``normal_*_n``, and ``contact_*``, the mean imprint of that gel in
-        mm, a control).
+        (``lift_mm``, ``unstable``) and the contact (``normal_*_n``; ``contact_*``, the gel's mean imprint in mm, a control).
     """
     bench, key = _bench(seed, obj), (seed, obj, index)
     thing, rng = bench.thing, np.random.default_rng([_PLAN, *key])

@@ -1,7 +1,6 @@
 """Objects to grasp (shapes and masses), and the MJCF of the scene with one of them.
 
-An object ("thing" in code) consists of a few primitive geoms, with a finish that the camera sees (`skin.py`). Dense parts
-look like bare metal.
+An object ("thing" in code) consists of a few primitive geoms. The camera sees a finish (`skin.py`), of dense parts metal.
 
 Frames: the gripper closes along x, an object's long side is along y, z is up and the table is z = 0.
 Shapes: N points. Units: metres, kilograms and newtons, except names that end in ``_mm``.

@@ -2,8 +2,7 @@
 
 It is one file for any number of processes. It needs no state of random generators, since all randomness is a function of
 (seed, step). Loading it executes no code (``weights_only``). torch.save writes a zip archive, whose checksums are compared
-when it is read. The last checkpoint before is kept as checkpoint.previous.pt until the run is finished, and used if this
-one is damaged.
+when it is read. The one before is kept as checkpoint.previous.pt until the run is finished, in case this is damaged.
 """
 
 import contextlib

@@ -41,8 +41,7 @@ class Step:
     def __call__(self, chunks: Sequence[Chunk], *, lr: float, seed: int, progress: float) -> dict[str, Tensor]:
         """Take one step on the ``chunks`` that this process embeds; returns the losses, detached, on the device.
 
-        ``seed`` is that of dropout and of random draws in losses. ``progress`` is the share of the run that is done after
-        this step, from 0 to 1.
+        ``seed`` is that of dropout and of random draws in losses. ``progress``: share of the run that is then done.
         """
         for group in self.optimiser.param_groups:
             group["lr"] = lr * group.get("lr_scale", 1.0)

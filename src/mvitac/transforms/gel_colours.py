@@ -26,8 +26,7 @@ SMOOTH, SURE = 36, 3.0
 four known simulated sensors best (t 5.1 to 5.9 with 100 images, 2.1 to 2.9 without blur). Below ``SURE`` it is refused."""
 
 MAX_CURL, MAX_STRETCH = 0.2, 30.0
-"""Above these limits the result is not a pair of slopes. Curl is .03 to .11 for gels, simulated and real, and .25 to .5
-for gray images."""
+"""Above these limits the result is not a pair of slopes. Curl is .03 to .11 for gels, .25 to .5 for gray images."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from PIL import Image
 
 from mvitac.data import video
 from mvitac.data.images import MAX_PIXELS, decode, to_gray
-from mvitac.system.files import brief
+from mvitac.system.files import brief, check_ordinary
 
 ARRAYS = (".h5", ".hdf5", ".zarr", ".zarr.zip")
 
@@ -161,6 +161,7 @@ def open_arrays(path: str | Path) -> Iterator[Any]:
     """Open an HDF5 file (h5py.File) or a zarr group for reading; ValueError if it, or something in it, is damaged."""
     hdf5 = str(path).lower().endswith(ARRAYS[:2])
     try:
+        check_ordinary(Path(path))  # a pipe never ends
         if hdf5:
             import h5py
 

@@ -1,9 +1,9 @@
 """Parquet files with images inside, as on the Hugging Face hub: columns of struct<bytes, path>, or of bytes.
 
 Class numbers are replaced by the class names in the file's metadata (ClassLabel). Nested columns are left out, except those
-of which an element is named. In a folder, the text before the first - of a file's name is the split:
+of which an element is named. In a folder, the text before the first - of a file's name, or its own folder, is the split:
 
-    data/train-00000-of-00002.parquet   data/test-00000-of-00001.parquet
+    data/train-00000-of-00002.parquet   data/test-00000-of-00001.parquet   validation/0000.parquet
 """
 
 from collections.abc import Collection, Sequence
@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from mvitac.datasets.table.image_refs import ImageRef, ParquetCell
 from mvitac.datasets.table.manifest import Manifest, Row, text_of
-from mvitac.system.files import brief, parse_json
+from mvitac.system.files import brief, check_ordinary, parse_json
 
 Refs = dict[str, list[ImageRef | None]]
 SPLITS = {"train": "train", "validation": "val", "valid": "val", "val": "val", "test": "test"}
@@ -28,7 +28,8 @@ def read_parquet(path: Path, files: Sequence[Path], vectors: Collection[str]) ->
     for file in files:
         before = len(rows)
         add_file(file, rows, found, vectors)
-        if side := SPLITS.get(file.stem.split("-")[0]):
+        inside = file.parent.name if file.parent not in (path, path.parent) else ""
+        if side := SPLITS.get(file.stem.split("-")[0]) or SPLITS.get(inside):
             for row in rows[before:]:
                 row.setdefault("split", side)
         for column in found:
@@ -45,6 +46,7 @@ def add_file(
     ``cameras``: which columns of images are wanted; by default all, and no row if there is no such column.
     """
     try:
+        check_ordinary(file)  # a pipe never ends
         opened = pq.ParquetFile(file)
         schema, classes = opened.schema_arrow, _classes(opened.schema_arrow)
         images = [field.name for field in schema if _is_image(field.type)]

@@ -88,8 +88,7 @@ class RowsConfig(DatasetConfig, ABC):
     background: tuple[str, ...] = ()
     """Columns of the no-contact images, one per touch column; default: "background"."""
     no_contact: tuple[str, ...] = ()
-    """Conditions on rows without contact, e.g. "phase=empty". They are not samples: the mean of the first 16 of a sensor
-    is its background."""
+    """Conditions on rows without contact, e.g. "phase=empty". No samples: a sensor's first 16 give its background."""
     log: tuple[str, ...] = ()
     """Logs with a clock of their own, as FILE:COLUMN (the column of time stamps), e.g. force.csv:stamp; stamp-0.35 sets
     that clock back. Their columns are joined to the rows by time (``datasets/table/clocks.py``)."""
