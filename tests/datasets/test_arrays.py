@@ -362,7 +362,7 @@ BAD: dict[str, tuple[dict[str, Any], dict[str, str], str]] = {
     "channels first": (flat(gel=np.zeros((20, 3, 16, 16), np.uint8)), {}, r"/gel is uint8 \[20, 3, 16, 16\], not"),
     "text for a number": (flat(force_n=["1", "2 N"] * 10), {}, r"row 2 \(a/1\): force_n is '2 N': give a finite"),
     "not UTF-8": (flat(force_n=np.array([b"\xff"] * 20)), {}, "force_n is not UTF-8 text in a"),
-    "a whole vector": (flat(), {"values": "pose:mm"}, r"pose is float64 \[20, 3\] in a: .*of lists one is named"),
+    "a whole vector": (flat(), {"values": "pose:mm"}, r"pose is '\[0\.0, .*give an element, such as pose\[0\]"),
     "past the vector": (flat(), {"values": "pose[3]:mm"}, r"pose\[3\] does not exist: pose has 3 numbers"),
 }
 

@@ -197,7 +197,7 @@ def _columns(
         text = data.dtype.kind in "UT" or _is_text(data)
         many = data.ndim > 2 or (data.ndim == 2 and data.shape[1] != 1 and name not in vectors)
         if many or (data.ndim and data.shape[0] != num) or (data.dtype.kind not in "biuf" and not text):
-            needs = f"a column has a number or a text for each of the {num} images; of lists one is named, {name}[0]"
+            needs = f"a column has a number or a text for each of the {num} images"
             left_out.setdefault(name, f"is {data.dtype} {list(data.shape)} in {demo}: {needs}")
         elif data.size > MAX_NUMBERS:
             left_out.setdefault(name, f"has {data.size:,} numbers: a column has at most {MAX_NUMBERS:,}")

@@ -115,7 +115,8 @@ def read_values(
             if counted and (cell := row[target.name]):
                 value = number_of(cell)
                 if value is None:
-                    raise ValueError(f"{table.at(i)}: {target.name} is {cell!r}: give a finite number, or nothing")
+                    of = f"an element, such as {target.name}[0]" if cell[0] in "[(" else "a finite number, or nothing"
+                    raise ValueError(f"{table.at(i)}: {target.name} is {cell!r}: give {of}")
                 columns[target.name][i] = value
     for name, found in columns.items():
         if len({value for value in found if value == value}) < 2:  # NaN differs from itself

@@ -18,7 +18,8 @@ from mvitac.datasets.table.manifest import Manifest, Row, text_of
 from mvitac.system.files import brief, check_ordinary, parse_json
 
 Refs = dict[str, list[ImageRef | None]]
-SPLITS = {"train": "train", "validation": "val", "valid": "val", "val": "val", "test": "test"}
+NAMES = {"train": "train training", "val": "val validation valid dev", "test": "test testing eval evaluation"}
+SPLITS = {name: split for split, names in NAMES.items() for name in names.split()}  # as the datasets library names them
 
 
 def read_parquet(path: Path, files: Sequence[Path], vectors: Collection[str]) -> Manifest | None:

@@ -160,8 +160,8 @@ class RowsConfig(DatasetConfig, ABC):
         return [Condition.parse(text).column for text in (*self.only, *self.label_only, *self.no_contact)]
 
     def vectors(self) -> set[str]:
-        """Return the columns of lists of numbers of which an element is named, such as state of state[2]."""
-        return {columns.element_of(name)[0] for name in self.numbers()} - {""}
+        """Return the columns that may be lists of numbers: what is named, such as state, or has an element state[2]."""
+        return {columns.element_of(name)[0] or name for name in self.numbers()}
 
     @abstractmethod
     def manifest(self) -> Manifest:
