@@ -3,7 +3,7 @@
 import json
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -297,11 +297,11 @@ def worse_mean(value: dict[str, Any]) -> None:
         sums[name] = [[factor * x for x in each] for each in sums[name]]
 
 
-def copied(to: str, of: str, value: dict[str, Any]) -> None:
-    """The values of one source are those that another one says."""
+def copied(to: str, of: str, value: dict[str, Any], names: Sequence[str] = ("sums", "clipped")) -> None:
+    """The values of one source, in its last seed, are those that another one says in its first."""
     records = value["blocks"][1]["records"]
-    one, other = (next(r for r in records if r["source"] == source) for source in (to, of))
-    one["sums"] = other["sums"]
+    one, other = (next(r for r in some if r["source"] == s) for some, s in ((records[::-1], to), (records, of)))
+    one |= {name: other[name] for name in names if name in other}
 
 
 def other_unit(value: dict[str, Any]) -> None:
@@ -395,7 +395,9 @@ FORGED: dict[str, tuple[Change, str]] = {
     "a worse mean": (worse_mean, "its errors are not those of one answer"),
     "values of pixels": (partial(copied, "", "pixels"), "light: touch, the encoder, linear, seed 0: has the sums of"),
     "controls alike": (partial(copied, "border", "pixels"), "touch, .*, linear, seed None: has the sums of touch, "),
-    "a control knows nothing": (partial(copied, "untrained", "mean"), "untrained, seed 0: has the sums of mean"),
+    "a control knows nothing": (partial(copied, "untrained", "mean"), "untrained, seed 1: has the sums of mean"),
+    "sums of a network": (partial(copied, "", "untrained", names=["sums"]), "the encoder, linear, seed 0: has the sums"),
+    "seeds alike": (partial(copied, "untrained", "untrained"), "untrained, linear, seed 0: has the sums of touch, untr"),
     "no unit": (put(*VALUES, "targets", value=[["light"]]), "not names and units"),
     "other seed": (put("encoder", "external", value={"seed": 9}), "its network is of other seeds, weights or senses"),
     "no licence": (lambda value: value["encoder"].pop("licence"), r"a\.json is damaged: .*'licence'"),
