@@ -395,7 +395,7 @@ FORGED: dict[str, tuple[Change, str]] = {
     "a worse mean": (worse_mean, "its errors are not those of one answer"),
     "values of pixels": (partial(copied, "", "pixels"), "light: touch, the encoder, linear, seed 0: has the sums of"),
     "controls alike": (partial(copied, "border", "pixels"), "touch, .*, linear, seed None: has the sums of touch, "),
-    "a control knows nothing": (partial(copied, "untrained", "mean"), "untrained, seed 1: has the sums of mean"),
+    "a control knows nothing": (partial(copied, "untrained", "mean"), "linear, seed 1: has the sums of mean"),
     "sums of a network": (partial(copied, "", "untrained", names=["sums"]), "the encoder, linear, seed 0: has"),
     "seeds alike": (partial(copied, "untrained", "untrained"), "untrained, linear, seed 0: has the sums of"),
     "no unit": (put(*VALUES, "targets", value=[["light"]]), "not names and units"),

@@ -167,7 +167,7 @@ def test_predict_command(
     assert main([*command, str(tmp_path / "some32"), "--out", str(out)]) == 0
     said = capsys.readouterr().err
     assert "1 of 2 rows are left out" in said
-    assert "touch shows 0:0:16:16 of the images, the model learned from the whole" in said
+    assert "touch shows 0:0:16:16, the model learned from whole images" in said
     assert main([*command, str(tmp_path / "some16"), "--out", str(out)]) == 2
     assert "some16 has images of vision of (16, 16, 3), the model takes (32, 32, 3)" in capsys.readouterr().err
     (tmp_path / "gel.csv").write_text("touch\ntouch.png\n")

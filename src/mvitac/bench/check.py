@@ -159,7 +159,7 @@ def _of_block(
             yield f"{what} {source or 'the encoder'}, {', '.join(map(str, key))}"
     rows: dict[str, list[Any]] = {}
     for record in records:
-        what = f"{record['modality']}, {record['source'] or 'the encoder'}, {record['probe']}, seed {record['seed']}"
+        what = _who(record)
         if have[record["source"], record["modality"], record["probe"], record["seed"]] > 1:
             yield f"{what}: is there twice"
         if why := _impossible(record, len(block["groups"]), one.folds):
@@ -175,6 +175,10 @@ def _of_block(
             yield f"its values are {given[0]}, those of the suite {named}"
 
 
+def _who(record: dict[str, Any]) -> str:
+    return f"{record['modality']}, {record['source'] or 'the encoder'}, {record['probe']}, seed {record['seed']}"
+
+
 def _copies(records: Sequence[dict[str, Any]]) -> Iterator[str]:
     """Values that other features cannot give: sums have ten digits. An encoder may be a control's network."""
     mean = [record["sums"] for record in records if record["source"] == "mean"]  # all that constant features give
@@ -183,13 +187,10 @@ def _copies(records: Sequence[dict[str, Any]]) -> Iterator[str]:
         apart = one["source"] != other["source"] or (one["source"] and one["seed"] != other["seed"])
         same = one["modality"] == other["modality"] and one["sums"] == other["sums"] and one["sums"] not in mean
         if same and apart and (fixed or one.get("clipped") != other.get("clipped")):
-            who = (
-                f"{r['modality']}, {r['source'] or 'the encoder'}, {r['probe']}, seed {r['seed']}" for r in (one, other)
-            )
-            yield ": has the sums of ".join(who)
+            yield f"{_who(one)}: has the sums of {_who(other)}"
     for record in records:
         if record["source"] in ("pixels", "untrained", "imagenet") and record["sums"] in mean:
-            yield f"{record['modality']}, {record['source']}, seed {record['seed']}: has the sums of mean"
+            yield f"{_who(record)}: has the sums of mean"
 
 
 Key = tuple[str, str, str, int | None]  # source ("" is the encoder), modality, probe, seed

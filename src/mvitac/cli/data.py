@@ -47,9 +47,7 @@ def pack(argv: list[str]) -> None:
     check_place(options.out)
     data: Any = options.data
     if data.frame_window() != Window():
-        raise ValueError(
-            "a pack stores every frame once: give --num-frames, --stride, --order, ... to what reads the pack"
-        )
+        raise ValueError("a pack stores every frame once: give --num-frames, ... to what reads the pack")
     given = {"max_damaged": options.max_damaged, "quiet": options.quiet, **data.build_options()}
     pack = build(data.source(), options.out, **given)
     print(f"{pack.path}: {pack.num} samples at {pack.size} px")

@@ -48,9 +48,7 @@ def warn_changed(run: str, pack: Pack) -> None:
     from mvitac.evaluation.evaluate import trained_on
 
     if trained_on(Path(run)) not in (None, pack.digest):
-        print(
-            f"mvitac: warning: the data of {run} changed since training: probes are fitted on the new", file=sys.stderr
-        )
+        print(f"mvitac: warning: the data of {run} changed since: probes are fitted on the new", file=sys.stderr)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -185,10 +185,8 @@ def predict(argv: list[str]) -> None:
     if config:
         pack = _opened(config, given, next(iter(engine.inputs.values()))[0])
         for m in [m for m in engine.inputs if pack.spec.crop.get(m) != engine.crop.get(m)]:
-            have, wanted = (crop.get(m, "the whole") for crop in (pack.spec.crop, engine.crop))
-            _say(
-                f"mvitac: warning: {m} shows {have} of the images, the model learned from {wanted}: pack it with --crop"
-            )
+            have, wanted = (crop.get(m, "whole images") for crop in (pack.spec.crop, engine.crop))
+            _say(f"mvitac: warning: {m} shows {have}, the model learned from {wanted}: pack it with --crop")
         about = ("group", "split") if isinstance(config, PackConfig) else ()  # those of a new table mean nothing
         if num := pack.num - _write(options.out, pack_tables(engine, pack, about), pack.num):
             _say(f"{num} of {pack.num} rows are left out: without an image that the model takes")
