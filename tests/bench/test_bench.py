@@ -201,10 +201,9 @@ def test_controls_of_the_data_that_changed_are_scored_again(
 def test_what_is_not_there_is_said(results: list[Path], root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     blocks = read_result(results[0])["blocks"]
     assert blocks[3]["not_run"].endswith("elsewhere is not there") and blocks[2]["form"] == "copy"
-    toys = find_suite(str(root / "toys.toml"))
-    assert open_set(toys.sets[0], None) == "no --data-root was given, where stripes would be"
     empty = "bench", RANDOM.format(0), "--suite", root / "toys.toml", "--out", root / "nothing"
-    assert "was scored on no task of toys: no --data-root was given" in said(capsys, *empty)
+    says = "was scored on no task of toys: no --data-root was given, where stripes would be"
+    assert says in said(capsys, *empty)
     assert not list((root / "nothing").glob("*.json"))
 
 
@@ -423,7 +422,6 @@ FORGED: dict[str, tuple[Change, str]] = {
     "simulated": (simulated, "elsewhere, pattern: vision cannot be left out because .*elsewhere is not there"),
     "leak": (put("blocks", 0, "leaks", value=[-1]), "a leak mark, a note, a group or what"),
     "group by": (lambda value: value["blocks"][0].pop("group_by"), "a leak mark, a note, a group or what"),
-    "list for a number": (put("encoder", "images_seen", value=[]), r"images_seen is \[\]"),
     "nothing": (lambda value: [not_run(block) for block in value["blocks"]], "was run on no task"),
     "twice": (put(*RECORDS, value=lambda records: [*records, records[0]]), "is there twice"),
     "modality": (lambda value: drop(value, source="", modality="both"), f"lacks the encoder, both, {FEW}, 0"),
@@ -439,8 +437,6 @@ FORGED: dict[str, tuple[Change, str]] = {
     "form": (put("blocks", 0, "form", value="mine"), "the suite has no form 'mine'"),
     "twins": (partial(untrained_as, twin), "untrained has the same sums in every record of seeds 0 and 1"),
     "true for a number": (put("encoder", "images_seen", value=True), "images_seen is True"),
-    "encoder without seeds": (lambda value: value["encoder"].pop("seeds"), "a.json is damaged"),
-    "block without data": (lambda value: value["blocks"][0].pop("data"), "a.json is damaged"),
 }
 
 

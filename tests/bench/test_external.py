@@ -150,9 +150,6 @@ def exits():
 def levels():
     return Net(), {"mean": (123, 117, 104)}
 
-def bare():
-    return Net()
-
 def wrong():
     return Net(), {"sides": 3}
 
@@ -196,7 +193,6 @@ def test_python_functions(pack: Pack, functions: str) -> None:
     keys = [open_model(f"{functions}{name}").on(pack)[0] for name in ("tokens", "same", "same")]
     assert len({net.features_key("touch") for net in keys}) == 3 and len({net.weights_digest() for net in keys}) == 2
     for name, words in (
-        ("bare", "no torch module and dict"),
         ("exits", "no torch module and dict"),
         ("levels", "images are in 0 to 1"),
         ("complex", "of torch.complex64 for two images"),

@@ -214,11 +214,7 @@ def test_files_that_are_no_videos(made: dict[str, Path], tmp_path: Path) -> None
     with pytest.raises(ValueError, match=r"cut\.mkv holds no frames: it is damaged or cut off"):
         video.frame_times(tmp_path / "cut.mkv")
     whole = made["mpeg4"].read_bytes()  # half of it lacks its table
-    for name, data in {
-        "text.mp4": b"not a video " * 100,
-        "empty.mp4": b"",
-        "cut.mp4": whole[: len(whole) // 2],
-    }.items():
+    for name, data in (("empty.mp4", b""), ("cut.mp4", whole[: len(whole) // 2])):
         (tmp_path / name).write_bytes(data)
         with pytest.raises(ValueError, match=rf"{name} cannot be read as a video .* damaged or cut off"):
             num_frames(tmp_path / name)

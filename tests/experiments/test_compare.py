@@ -107,7 +107,8 @@ def test_rows_the_data_does_not_allow_are_told(tmp_path: Path) -> None:
     assert "the same run as 'no flips'" in work.left_out["no touch flips"]
     assert "lacks a modality" in work.left_out["losses vv"]
     wrong: dict[str, object] = {"method.tau": 1}
-    for method, fields, words in (("cmc", {}, "no row that"), ("moc", {}, "unknown"), ("moco", wrong, "unknown")):
+    unknown = "row 'MViTac': unknown method 'moc'"
+    for method, fields, words in (("cmc", {}, "no row that"), ("moc", {}, unknown), ("moco", wrong, "unknown")):
         plan = small(pack, rows=(Row(label="MViTac", method=method, set=fields),))
         with pytest.raises(ValueError, match=words):
             lay_out(plan, pack, tmp_path / "out", ProbeConfig())
@@ -196,13 +197,6 @@ def test_damaged_plans_are_one_line(tmp_path: Path, text: str, says: str) -> Non
         find_plan(str(tmp_path / "p.toml"))
 
 
-def test_an_unknown_method_is_told_of_its_own_row(pack: Pack) -> None:
-    plan = small(pack, rows=(Row(label="MViTac"), Row(label="x", method="nope")))
-    assert plan.data and plan.run(plan.rows[0], plan.data, 0).method.name == "mvitac"
-    with pytest.raises(ValueError, match="row 'x': unknown method 'nope'"):
-        plan.run(plan.rows[1], plan.data, 0)
-
-
 def test_some_rows_of_a_plan_stand_beside_its_reference() -> None:
     assert [row.label for row in TABLE1.only(["SSVTP", "TAG (CMC)"]).rows] == ["TAG (CMC)", "SSVTP", "MViTac"]
     assert TABLE1.only([]) == TABLE1
@@ -261,9 +255,7 @@ def test_result_and_tables_agree(done: tuple[Path, dict]) -> None:
     ("data", "probe", "pairs", "shown"),
     [
         ("touch-and-go (official)", "paper", "one row", True),
-        ("touch-and-go (by-recording)", "paper", "one row", False),
         ("touch-and-go (official, partial)", "paper", "one row", False),
-        ("materials", "paper", "one row", False),
         ("touch-and-go (official)", "linear", "one row", False),
         ("touch-and-go (official)", "paper", "two rows of a touch", False),
     ],
