@@ -3,7 +3,6 @@ from __future__ import annotations
 import gc
 import os
 import shutil
-import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -58,14 +57,6 @@ def turned(tmp_path_factory: pytest.TempPathFactory) -> Pack:
     from support.toy import Turned
 
     return build(Turned(), tmp_path_factory.mktemp("turned") / "pack", size=32, quiet=True)
-
-
-@pytest.fixture
-def ctrl_c() -> Iterator[None]:
-    """Ctrl-C raises, as in a terminal; a shell that starts pytest in the background has it ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

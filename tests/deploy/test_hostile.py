@@ -181,7 +181,6 @@ WEIGHT, BIAS = "pattern.touch.weight", "pattern.touch.bias"
 NO_SPREAD = {"name": "n", "unit": "N", "edges": [], "spread": []}
 LARGE = 10**9  # every image would be resized to it
 OTHER = "its model was trained with"
-ABOVE = put("files", "../trap/pairs.csv", value="0")
 ARTIFACTS: dict[str, tuple[dict[str, Any], str]] = {
     "a pickle": ({"files": {MODEL: pickle.dumps(Payload())}}, "cannot be read as safetensors"),
     "a huge header": ({"files": {MODEL: (1 << 40).to_bytes(8, "little") + b"{"}}, "cannot be read as safetensors"),
@@ -189,7 +188,7 @@ ARTIFACTS: dict[str, tuple[dict[str, Any], str]] = {
     "trunk from the Hub": ({"run": encoder(trunk="hf-hub:stranger/model")}, "unknown trunk"),
     "trunk from a folder": ({"run": encoder(trunk="local-dir:{trap}")}, "unknown trunk"),
     "a field that is none": ({"run": put("exec", value="rm")}, "unknown field in run 'exec'"),
-    "file above": ({"about": ABOVE}, "names others than"),
+    "file above": ({"about": put("files", "../trap/pairs.csv", value="0")}, "names others than"),
     "without model": ({"about": lambda about: about["files"].pop(MODEL)}, "lacks files"),
     "normalisation": ({"about": put("preprocessing", "mean", value=[0.5] * 3)}, f"mean is .*, {OTHER}"),
     "side": ({"about": put("preprocessing", "size", value=31)}, f"size is 31, {OTHER}"),
@@ -202,7 +201,6 @@ ARTIFACTS: dict[str, tuple[dict[str, Any], str]] = {
 EXPORTS: dict[str, tuple[dict[str, Any], str]] = {
     name: ({"about": change}, says)
     for name, (change, says) in {
-        "file above": (ABOVE, "names others than"),
         "no tolerance": (lambda about: about.pop("tolerance"), "is damaged"),
         "no spread": (put("values", value={"force": [NO_SPREAD]}), "0 edges and 0 spreads: give n ascending"),
         "a class that is no text": (put("classes", "pattern", value=[1]), r"export\.json: classes\.pattern: expected"),

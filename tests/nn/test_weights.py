@@ -139,7 +139,6 @@ def vit(state: State) -> State:
 
 
 WRONG: dict[str, tuple[Callable[[State], dict[str, Any]], str]] = {
-    "empty": (lambda w: {}, "holds no named weights"),
     "nothing but settings": (lambda w: {"args": {"lr": 0.1}}, "holds no named weights"),
     "vit": (vit, r"\d+ tensors \(conv1.*\) missing, \d+ tensors \(cls_token"),
     "no layer4": (lambda w: without("layer4.", w), r"does not fit test_resnet: \d+ tensors \(layer4\.0.*\) missing$"),
