@@ -19,6 +19,8 @@ from filelock import FileLock
 
 if TYPE_CHECKING:  # pytest's main process, which runs no test, needs no torch
     from mvitac.data.pack import Pack
+    from mvitac.deploy.engine import Engine
+    from mvitac.model import Model
 
 # A test can kill a process, which loses nothing that was written, but not cut the power.
 os.fsync = lambda file: None
@@ -84,6 +86,13 @@ def artifact(smoke_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return publish(smoke_run, tmp_path_factory.mktemp("artifact") / "artifact")
 
 
+@pytest.fixture(scope="module")
+def model(artifact: Path) -> Model:
+    from mvitac.deploy.artifact import load
+
+    return load(artifact)
+
+
 @pytest.fixture
 def copy(artifact: Path, tmp_path: Path) -> Path:
     return shutil.copytree(artifact, tmp_path / "artifact")
@@ -107,6 +116,13 @@ def onnx(artifact: Path, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -
     from mvitac.deploy.export import export
 
     return made_once(tmp_path_factory, "onnx", lambda out: export(load(artifact), pack, out))
+
+
+@pytest.fixture(scope="module")
+def engine(onnx: Path) -> Engine:
+    from mvitac.deploy.engine import Engine
+
+    return Engine(onnx, threads=1)
 
 
 @pytest.fixture(scope="session")

@@ -85,11 +85,6 @@ def test_load_gives_a_model_that_embeds_and_is_probed(pack: Pack) -> None:
         model.trunk("touch")
 
 
-def test_seeds_draw_other_weights_and_repeat_themselves() -> None:
-    digests = [open_model(f"{TINY},seed={seed}").weights_digest() for seed in (0, 1, 0)]
-    assert digests[0] == digests[2] != digests[1]
-
-
 def test_sensors_are_encoded_one_by_one(pack: Pack, tmp_path: Path) -> None:
     two = toy_pack(tmp_path / "two", touch_channels=6, num=12)
     model, two = open_model(f"{TINY},reads=touch").on(two)

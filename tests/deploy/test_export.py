@@ -36,11 +36,6 @@ from support.training_runs import smoke
 EXACT = {"min_cosine": 0.9999, "accuracy_loss": 0.0}
 
 
-@pytest.fixture(scope="module")
-def model(artifact: Path) -> Model:
-    return mvitac.load(artifact)
-
-
 def run_graph(graph: ExportModule):
     def call(arrays: list[np.ndarray]) -> list[np.ndarray]:
         with torch.no_grad():

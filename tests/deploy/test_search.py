@@ -11,17 +11,11 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-import mvitac
 from mvitac.cli.main import main
 from mvitac.data.images import fit
 from mvitac.data.pack import Pack
 from mvitac.deploy.search import Embeddings, nearest, unit
 from mvitac.model import Model
-
-
-@pytest.fixture(scope="module")
-def model(artifact: Path) -> Model:
-    return mvitac.load(artifact)
 
 
 @pytest.fixture(scope="module")

@@ -33,11 +33,6 @@ from support.toy import film
 from support.videos import numbered, read_number, write_video
 
 
-@pytest.fixture(scope="module")
-def engine(onnx: Path) -> Engine:
-    return Engine(onnx, threads=1)
-
-
 class Other(Engine):
     """An opened engine, some of whose attributes are changed."""
 

@@ -25,11 +25,6 @@ FIRST = LiveConfig(calibration=8)
 
 
 @pytest.fixture(scope="module")
-def engine(onnx: Path) -> Engine:
-    return Engine(onnx, threads=1)
-
-
-@pytest.fixture(scope="module")
 def films(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """50 frames of touch at 25 a second, 20 without contact, and 24 of vision at 12."""
     folder, noise = tmp_path_factory.mktemp("films"), np.random.default_rng(0).integers(0, 4, (NUM, 120, 160, 3))
