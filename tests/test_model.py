@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import timm
 import torch
 from PIL import Image
 from torch.utils.data import DataLoader
@@ -162,8 +163,6 @@ def test_transform_prepares_images_in_a_data_loader(model: Model) -> None:
 
 
 def test_trunk_is_a_plain_timm_model(pack: Pack, tmp_path: Path) -> None:
-    import timm
-
     run = smoke(pack)
     run = replace(run, encoder=run.encoder.changed(trunk="resnet10t"), augment=replace(run.augment, whole=24))
     model = fresh(run, pack.spec, 32)

@@ -1,6 +1,7 @@
 """Several packs as one: rows, images, tasks and splits are those of the parts, and what cannot be mixed is refused."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -191,8 +192,6 @@ def test_what_cannot_be_mixed_is_refused(pack: Pack, tmp_path: Path) -> None:
     ],
 )
 def test_a_mistake_is_one_line(given: list[str], says: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    import re
-
     asked = ["pretrain", "--data", "mix", "--recipe", "smoke", "--out", str(tmp_path / "run"), "--data.parts", *given]
     assert main(asked) == 2
     said = capsys.readouterr().err

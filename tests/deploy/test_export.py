@@ -29,6 +29,7 @@ from mvitac.deploy.publish import with_probes
 from mvitac.evaluation.probe import score_rows, split_rows
 from mvitac.model import Model, fresh
 from mvitac.nn.linear_probe import Error
+from mvitac.transforms.random_views import plain_view
 from support.processes import begin, finish
 from support.toy import renumbered, toy_pack
 from support.training_runs import smoke
@@ -76,8 +77,6 @@ def test_where_8_bits_are_too_few_the_way_out_is_said(
 
 @pytest.mark.parametrize("stored", [32, 45, 72])
 def test_the_resize_in_the_graph_is_the_probes_pixel_by_pixel(stored: int, model: Model) -> None:
-    from mvitac.transforms.random_views import plain_view
-
     generator = torch.Generator().manual_seed(0)
     images = torch.randint(0, 256, (3, 3, stored, stored), dtype=torch.uint8, generator=generator)
     was, model.stored = model.stored, stored

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
+from sklearn.neighbors import NearestNeighbors
 
 from mvitac.cli.main import main
 from mvitac.data.images import fit
@@ -26,8 +27,6 @@ def known(artifact: Path, pack: Pack, tmp_path_factory: pytest.TempPathFactory) 
 
 
 def test_equals_scikit_learn() -> None:
-    from sklearn.neighbors import NearestNeighbors
-
     rng = np.random.default_rng(1)
     bank, queries = (unit(rng.normal(size=(num, 32)).astype(np.float32)) for num in (3000, 20))
     by = NearestNeighbors(n_neighbors=5, algorithm="brute", metric="cosine").fit(bank)

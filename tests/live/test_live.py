@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,7 +29,7 @@ from mvitac.live.recorder import Recorder, finish
 from mvitac.live.streams import Event, Stream
 from mvitac.model import Model
 from mvitac.system.files import read_json, write_json
-from support.faults import Clock, Rig, World, faulty
+from support.faults import NAMES, Clock, Rig, World
 from support.toy import film
 from support.videos import numbered, read_number, write_video
 
@@ -149,9 +150,31 @@ def test_a_background_is_forgotten_between_frames(engine: Engine) -> None:
 def test_minutes_of_faults(engine: Engine) -> None:
     """Each kind of fault on each stream. One a minute for an hour: MVITAC_MINUTES=60 pytest -s -k minutes_of_faults."""
     num, seconds = (int(os.environ["MVITAC_MINUTES"]), 60) if "MVITAC_MINUTES" in os.environ else (10, 30)
-    world, made, memory = faulty(engine, num, seconds)
-    traced, resident = ([at[i] for at in memory[2:]] for i in (0, 1))
-    assert len(set(made)) == 10 and world.live.num_touches > num * (seconds - 15) / 3
+    world, made, memory = World(engine), set(), []
+    world.run(9)
+    del world.heard[:]  # that it is calibrated
+    tracemalloc.start()
+    try:
+        for i in range(num):
+            fault, stream = [*NAMES][i % 5], ("touch", "vision")[i // 5 % 2]
+            broken = 0.15 if fault == "damaged" else 4
+            world.run(seconds / 2)
+            world.rigs[stream].fault = fault
+            world.run(broken)
+            world.rigs[stream].fault = ""
+            world.run(seconds / 2 - broken)
+            said = [e.what for e in world.heard if e.stream == stream and e.what in sum(NAMES.values(), ())]
+            assert tuple(dict.fromkeys(said)) == tuple(dict.fromkeys(NAMES[fault])), (i, fault, stream, said)
+            others = [e.what for e in world.heard if e.stream != stream]
+            assert not others, (i, fault, stream, others)
+            made.add((fault, stream))
+            del world.heard[:]
+            pages = int(Path("/proc/self/statm").read_text().split()[1])
+            memory.append((tracemalloc.get_traced_memory()[0], pages))
+    finally:
+        tracemalloc.stop()
+    assert len(made) == 10 and world.live.num_touches > num * (seconds - 15) / 3
+    traced, resident = zip(*memory[2:], strict=True)
     assert max(traced) - min(traced) < 64_000, memory
     assert max(resident) < 1.05 * resident[0], memory
 

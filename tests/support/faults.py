@@ -1,20 +1,14 @@
 """Live input on a fake clock: a robot that touches every three seconds, and something that breaks every minute."""
 
-import os
-import tracemalloc
-from collections import Counter
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mvitac.deploy.engine import Engine
 from mvitac.live.cameras import Ended, Source
 from mvitac.live.contact import LiveConfig
 from mvitac.live.predictor import Live
 from mvitac.live.streams import Event, Stream
 
-FAULTS = ("unplugged", "frozen", "resolution", "damaged", "stalled")
 NAMES = {
     "unplugged": ("unplugged", "back"),
     "frozen": ("frozen", "moving again"),
@@ -22,7 +16,7 @@ NAMES = {
     "damaged": ("damaged frame",),
     "stalled": ("stalled", "running again"),
 }
-"""What live must say of each fault, in order."""
+"""What live must say of each fault of a sensor, in order."""
 
 
 class Clock:
@@ -91,36 +85,3 @@ class World:
                     if self.rigs[m].fault != "stalled":
                         self.streams[m][0].pump()
             self.live.tick()
-
-
-def resident() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
-def faulty(engine: Engine, num: int, seconds: float) -> tuple[World, list[tuple[str, str]], list[tuple[int, int]]]:
-    """Make ``num`` faults, one in each ``seconds``; returns the world, the (fault, stream) made, and after each the bytes
-    that Python has allocated since the first and those of the whole process."""
-    world = World(engine)
-    world.run(9)
-    made, memory = [], []
-    tracemalloc.start()
-    try:
-        for i in range(num):
-            fault, stream = FAULTS[i % len(FAULTS)], ("touch", "vision")[i // len(FAULTS) % 2]
-            broken = 0.15 if fault == "damaged" else 4
-            before = len(world.heard)
-            world.run(seconds / 2)
-            world.rigs[stream].fault = fault
-            world.run(broken)
-            world.rigs[stream].fault = ""
-            world.run(seconds / 2 - broken)
-            said = [e.what for e in world.heard[before:] if e.stream == stream and e.what in sum(NAMES.values(), ())]
-            assert tuple(dict.fromkeys(said)) == tuple(dict.fromkeys(NAMES[fault])), (i, fault, stream, said)
-            others = Counter(e.what for e in world.heard[before:] if e.stream != stream)
-            assert not others, (i, fault, stream, others)
-            made.append((fault, stream))
-            del world.heard[:]
-            memory.append((tracemalloc.get_traced_memory()[0], resident()))
-    finally:
-        tracemalloc.stop()
-    return world, made, memory

@@ -21,11 +21,11 @@ from mvitac.model import fresh, load
 from mvitac.recipes import recipe
 from mvitac.run import Optim, Run
 from mvitac.system import files
+from mvitac.training import validation
 from mvitac.training.checkpoint import CHECKPOINT, PREVIOUS
 from mvitac.training.loader import ImageLoader
 from mvitac.training.loop import Diverged, train
 from mvitac.training.sampler import combine_seeds, draw_positives, epoch_order
-from mvitac.training.validation import validate
 from mvitac.transforms.random_views import Augment
 from support.processes import begin, finish
 from support.toy import toy_pack, with_columns
@@ -179,13 +179,10 @@ def test_learns_the_stripes(tmp_path: Path) -> None:
 
 
 def test_evaluation_never_reads_test_rows(pack: Pack, smoke_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import mvitac
-    from mvitac.training import validation as module
-
     used: list[np.ndarray] = []
-    real = module.pack_features
-    monkeypatch.setattr(module, "pack_features", lambda *given, **how: used.append(given[3]) or real(*given, **how))
-    validate(mvitac.load(smoke_run), pack, smoke(pack))
+    real = validation.pack_features
+    monkeypatch.setattr(validation, "pack_features", lambda *given, **how: used.append(given[3]) or real(*given, **how))
+    validation.validate(load(smoke_run), pack, smoke(pack))
     assert used and not set(np.concatenate(used)) & set(pack.rows("test"))
 
 
