@@ -238,7 +238,7 @@ def readers(base: Path) -> dict[str, tuple[list[Path], Callable[[], Any]]]:
         own = copy.deepcopy(method)
         optimiser = Step(run, own, torch.device("cpu")).optimiser
         with redirect_stderr(io.StringIO()):
-            done, _ = checkpoint.restore(base / "run", run, own, optimiser)
+            done, _ = checkpoint.restore(base / "run", run, own, optimiser, run.num_steps(NUM))
         state = optimiser.state_dict()
         moments = {f"{i} {name}": value for i, values in state["state"].items() for name, value in values.items()}
         return done, safetensors_digest(own.state_dict()), safetensors_digest(moments), state["param_groups"]

@@ -227,6 +227,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1350, help="steps of rows that are trained on several sets")
     parser.add_argument("--own-steps", type=int, default=300, help="steps of rows that are trained on one set")
     args = parser.parse_args()
+    if not args.manifests.is_dir():
+        parser.error(f"{args.manifests} is not there: write the manifests by examples/real_manifests.py")
     if not (args.out / "packs" / "sim").exists():
         data = recipe("quick").data
         build(data.source(), args.out / "packs" / "sim", size=data.size)

@@ -25,7 +25,8 @@ def main(runs: list[str]) -> None:
     for run in runs:
         model = mvitac.load(run)
         pack = model.open_data()
-        task = next(task for task in pack.spec.values if task.name == "same")
+        if (task := next((task for task in pack.spec.values if task.name == "same"), None)) is None:
+            sys.exit(f"{run}: its data has no task same: give runs of a supervised row of examples/pose.toml")
         rows = split_rows(pack, task, "touch").test
         z = torch.from_numpy(features(model, pack, "touch", rows, for_heads=True))
         values = pack.values(task)[rows]

@@ -5,6 +5,7 @@
 #   examples/real.sh ../shared/data runs/real
 #   STEPS=150 SETS="vt60 physiclear-by-group" examples/real.sh ...    # shorter runs, only these datasets
 set -euo pipefail
+[ -d "${1:-}" ] && [ $# -gt 1 ] || { echo "data folder ${1:-} is not there, or no output folder was named" >&2; exit 2; }
 data=$1 out=$2
 shift 2
 options=("$@")

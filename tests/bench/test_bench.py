@@ -406,7 +406,9 @@ FORGED: dict[str, tuple[Change, str]] = {
     "errors in another unit": (other_unit, "its errors are smaller than those of any one answer"),
     "control of the data": (own_control, "lacks width, none, linear, None"),
     "note": (put("blocks", 0, "notes", value=[5]), "a leak mark, a note, a group or what groups are is no text"),
-    "clipped": (put(*VALUES, "clipped", value=[9, 4]), "9 of its 4 features were clipped"),
+    "clipped of what": (put(*VALUES, "clipped", value=[9]), r"it says that \[9\] features were clipped"),
+    "features": (put("encoder", "features", "touch", value=-64), "touch is -64"),
+    "clipped": (put(*VALUES, "clipped", value=[9, 4]), r"it says that \[9, 4\] features were clipped"),
     "excuse": (put("blocks", 0, "left_out", value={"vision": NO_VISION}), NO_VISION),
     "excuse of a lost encoder": (no_touch, f"stripes, light: touch cannot be left out because {NO_TOUCH}"),
     "no reason": (no_vision, "stripes, pattern: both cannot be left out because x"),
@@ -638,6 +640,7 @@ def test_shipped_suites_keep_their_definitions() -> None:
     ("text", "expected"),
     [
         ("name = ", "is not a suite"),
+        (SUITE.replace('"toys"', '" "'), "the suite has no name"),
         (SUITE.replace(FORM, f'{FORM}\npins = {{ rows = "0" }}', 1), "form 'pack' has pins, .* leave them out"),
         (SUITE.replace("title = ", r'title = "\u0007" #', 1), "is not a suite .control character"),
         (SUITE.replace('"folded"', '"stripes"'), "of stripes, stripes, elsewhere one is there twice"),

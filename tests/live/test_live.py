@@ -310,6 +310,10 @@ def test_a_camera_is_asked_for_a_mode(monkeypatch: pytest.MonkeyPatch) -> None:
     for text in ("3@60", "3@333x240"):
         with pytest.raises(OSError, match="no such mode: it gives 640x"):
             source(text, "touch").open()
+    with pytest.raises(OSError, match=r"no camera with serial \*\* is"):
+        source("serial:**", "touch").open()
+    with pytest.raises(ValueError, match="give the camera's serial number after serial:"):
+        source("serial:@320x240", "touch")
 
 
 def heard(rig: type[Rig], clock: Clock) -> list[Event]:

@@ -80,7 +80,7 @@ def three_steps(
 def third_step(start: Callable[[], tuple[Method, Step]], parts: list[Chunk], run: Run, of: Path) -> dict[str, Tensor]:
     """The weights after the last of these, begun from the checkpoint ``of``."""
     method, step = start()
-    assert checkpoint.restore(of, run, method, step.optimiser) == (2, {})
+    assert checkpoint.restore(of, run, method, step.optimiser, 2) == (2, {})
     step(parts, lr=5e-3, seed=2, progress=0.5)
     return method.state_dict()
 

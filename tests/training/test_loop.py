@@ -1,5 +1,6 @@
 """The loop: resumed = straight bit for bit, batches without near-duplicates, a loss that stops when it is no number."""
 
+import copy
 import os
 import shutil
 import zipfile
@@ -22,11 +23,14 @@ from mvitac.recipes import recipe
 from mvitac.run import Optim, Run
 from mvitac.system import files
 from mvitac.training import validation
-from mvitac.training.checkpoint import CHECKPOINT, PREVIOUS
+from mvitac.training.checkpoint import CHECKPOINT, PREVIOUS, restore
 from mvitac.training.loader import ImageLoader
+from mvitac.training.log import read_log
 from mvitac.training.loop import Diverged, train
 from mvitac.training.sampler import combine_seeds, draw_positives, epoch_order
+from mvitac.training.step import Step
 from mvitac.transforms.random_views import Augment
+from support.forged_packs import put
 from support.processes import begin, finish
 from support.toy import toy_pack, with_columns
 from support.training_runs import assert_equal_weights, batches, log_of, power_cut, smoke, stopped_at, views_by
@@ -87,6 +91,30 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(
     train(run, out, resume=True, quiet=True)
     assert_equal_weights(smoke_run, out)
     assert capsys.readouterr().err == "" and not (out / PREVIOUS).exists()
+
+
+def test_a_checkpoint_of_other_kinds_gives_way_to_the_one_before(pack: Pack, tmp_path: Path) -> None:
+    run = cut_after(5, pack, tmp_path)
+    whole = torch.load(tmp_path / CHECKPOINT, weights_only=True)
+    for *where, value in (
+        *(("step", 9), ("step", -1), ("step", "x"), ("validation", None), ("method", {}), ("optimiser", None)),
+        ("optimiser", "state", 0, "exp_avg", "x"),
+    ):
+        put(*where, value=value)(state := copy.deepcopy(whole))
+        torch.save(state, tmp_path / CHECKPOINT)
+        method = run.method.build(pack.spec, run.encoder)
+        optimiser = Step(run, method, torch.device("cpu")).optimiser
+        assert restore(tmp_path, run, method, optimiser, 8)[0] == 2, (where, value)
+
+
+LINES = "[]", '{"step": 4, "loss": {}}', '{"step": 4, "eval": null}', '{"step": 4, "eval": {"a": []}}'
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_a_log_ends_before_what_is_none(line: str, tmp_path: Path) -> None:
+    good = '{"step": 0, "eval": {}, "verdict": "x"}', '{"step": 2, "loss": 1}'
+    (tmp_path / "log.jsonl").write_text("\n".join([*good, line]))
+    assert [entry["step"] for entry in read_log(tmp_path)] == [0, 2]
 
 
 def test_killed_between_two_checkpoints(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:

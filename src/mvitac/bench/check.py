@@ -114,8 +114,9 @@ def problems_of(encoder: dict[str, Any], controls: Sequence[str]) -> Iterator[st
         yield f"the encoder {why}: give --name"
     seeds, weights = encoder["seeds"], encoder["weights"]
     seen = 0 if encoder["images_seen"] is None else encoder["images_seen"]
-    numbers = {"images_seen": seen, "size": encoder["size"], **encoder["parameters"]}
-    yield from (f"{key} is {n}" for key, n in numbers.items() if type(n) is not int or not 0 <= n < 1e18)
+    sizes = [*encoder["parameters"].items(), *encoder.get("features", {}).items()]
+    numbers = [("images_seen", seen), ("size", encoder["size"]), *sizes]
+    yield from (f"{key} is {n}" for key, n in numbers if type(n) is not int or not 0 <= n < 1e18)
     texts = {key: encoder[key] for key in ("licence", "trained_on")}
     yield from (f"{key} is no text" for key, text in texts.items() if not isinstance(text, str | None))
     if not are_digests(weights):
@@ -216,9 +217,9 @@ def _impossible(record: dict[str, Any], num_groups: int, folds: int) -> str:
     names = SUMS if "targets" in record else COUNTS
     if {*record["sums"]} != {*names} or {*record} - {*KEY, "clipped", "targets", "sums"}:
         return f"its fields are {sorted(record)}, its sums {sorted(record['sums'])}"
-    clipped, of = record.get("clipped", (0, 0))
-    if not 0 <= clipped <= of < 1e9:
-        return f"{clipped} of its {of} features were clipped"
+    clipped = record.get("clipped", [0, 0])  # of how many features
+    if [*map(type, clipped)] != [int, int] or not 0 <= clipped[0] <= clipped[1] < 1e9:
+        return f"it says that {clipped} features were clipped"
     try:
         sums = {name: np.array(record["sums"][name], float) for name in names}
         kinds = {np.array(values).dtype.kind for values in record["sums"].values()}

@@ -40,6 +40,9 @@ class About:
     def __post_init__(self) -> None:
         if self.name and (why := wrong_name(self.name, (*CONTROLS, GUESS))):
             raise ValueError(f"--name: the encoder {why}: give another")
+        for key, text in (("licence", self.licence), ("trained-on", self.trained_on)):
+            if not text.isprintable():  # a terminal would obey it
+                raise ValueError(f"--{key}: {text!r} has a control character: leave it out")
 
 
 def run_bench(places: Sequence[str], suite: Suite, out: Path, root: Path | None, about: About) -> Path:

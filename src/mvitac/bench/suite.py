@@ -88,6 +88,8 @@ class Suite:
     sets: tuple[SuiteSet, ...]
 
     def __post_init__(self) -> None:
+        if not self.name.strip():
+            raise ValueError("the suite has no name: give one")
         if self.seed < 0:
             raise ValueError(f"suite {self.name!r}: seed {self.seed}: give a number >= 0")
         if not ({*self.probes} & {*VALUE_PROBES} and self.untrained and self.sets):

@@ -69,9 +69,10 @@ def bench(argv: list[str]) -> None:
         raise ValueError("name the encoder: the folder of a run or an artifact (see mvitac bench --help)")
     if not options.suite.endswith(".toml"):
         check_known("suite", [options.suite], [*suites, "FILE.toml"])
-    if options.suite in loop.shipped():
-        if options.data_root:
-            raise ValueError(f"--data-root has no effect on {options.suite}, which is simulated: leave it out")
+    suite = None if options.suite in loop.shipped() else find_suite(options.suite)
+    if options.data_root and not (suite and any(form.at for one in suite.sets for form in one.forms)):
+        raise ValueError(f"--data-root has no effect on {options.suite}, which is simulated: leave it out")
+    if not suite:
         with shown():
             path = loop.run_suite(options.models, loop.find_suite(options.suite), options.out, options.about)
         own, value = loop.read_control(path)
@@ -79,7 +80,6 @@ def bench(argv: list[str]) -> None:
             print(f"{own.name}, {condition}\n{tabulate(rows, columns)}\n")
         print(f"{loop.note(own, [value])}\nwritten: {path}")
         return
-    suite = find_suite(options.suite)
     with shown():
         path = run_bench(options.models, suite, options.out, options.data_root, options.about)
     result = read_result(path)

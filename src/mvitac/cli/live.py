@@ -50,6 +50,10 @@ class _Common:
     """CPU threads for the model; 0 = all cores."""
     live: Annotated[LiveConfig, tyro.conf.arg(name="")] = LiveConfig()
 
+    def __post_init__(self) -> None:
+        if "" in (self.vision, *self.touch):
+            raise ValueError("--vision or --touch is empty: name a SOURCE, or leave it out")
+
     def free(self) -> list[np.ndarray]:
         if self.background and self.live.calibration != LiveConfig.calibration:
             raise ValueError("--calibration has no effect beside --background: leave one out")
@@ -81,6 +85,7 @@ class _Options(_Common):
     """Predict from every frame, in contact or not."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_range(self, 1e-3, math.inf, "stale", *(["seconds"] if self.seconds is not None else []))
 
 

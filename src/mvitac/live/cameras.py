@@ -3,6 +3,7 @@
 Clocks, threads and faults are in ``live/streams.py``. Frames are uint8 RGB [H, W, 3].
 """
 
+import glob
 import importlib.util
 import re
 from abc import ABC, abstractmethod
@@ -62,7 +63,7 @@ class Camera(Source):
 
         target: int | str = int(self.which) if self.which.isdigit() else self.which
         if isinstance(target, str) and not target.startswith("/"):
-            links = sorted(Path("/dev/v4l/by-id").glob(f"*{target}*-index0"))
+            links = sorted(Path("/dev/v4l/by-id").glob(f"*{glob.escape(target)}*-index0"))
             if not links:
                 raise OSError(f"no camera with serial {target} is plugged in")
             target = str(links[0].resolve())
@@ -221,6 +222,8 @@ def source(text: str, modality: str) -> Source:
     elif mode and (mode["which"].isdigit() or text.startswith(("/dev/", "serial:"))):
         if importlib.util.find_spec("cv2") is None:
             raise ValueError(f"source {text!r} needs OpenCV: pip install -e '.[live]' in mvitac's clone")
+        if mode["which"] == "serial:":
+            raise ValueError(f"source {text!r}: give the camera's serial number after serial:")
         size = (int(mode["width"]), int(mode["height"])) if mode["width"] else None
         found = Camera(mode["which"].removeprefix("serial:"), size, float(mode["fps"]) if mode["fps"] else None)
     else:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from mvitac.methods.base import Method
 from mvitac.run import Run
@@ -41,9 +42,9 @@ def save(
 
 
 def restore(
-    out: Path, run: Run, method: Method, optimiser: torch.optim.Optimizer, world: World | None = None
+    out: Path, run: Run, method: Method, optimiser: torch.optim.Optimizer, num_steps: int, world: World | None = None
 ) -> tuple[int, dict[str, Any]]:
-    """Load the checkpoint in the run's folder ``out`` into ``method`` and ``optimiser``.
+    """Load the checkpoint in the run's folder ``out``, of ``num_steps`` in all, into ``method`` and ``optimiser``.
 
     If it is damaged, it is deleted and the one before it is used, with a message on stderr. Returns the number of steps
     that are done, 0 without a checkpoint, and what it kept; ValueError if both are damaged, or belong to another run.
@@ -55,13 +56,13 @@ def restore(
                 if (name := archive.testzip()) is not None:
                     raise ValueError(f"{name} does not match its checksum")
             state = torch.load(path, map_location="cpu", weights_only=True)
+            if mine := state["run"] == run.digest():
+                _load(state, method, optimiser, num_steps)
         except Exception as error:  # zipfile and torch raise several types for damaged files
             damage = damage or f"{path} is damaged ({brief(error)})"
             continue
-        if state.get("run") != run.digest():
+        if not mine:
             raise ValueError(f"{path} belongs to another run: restore the one of this run, or delete it to start over")
-        method.load_state_dict(state["method"])
-        optimiser.load_state_dict(state["optimiser"])
         if damage and (world is None or world.is_main):
             print(f"mvitac: {damage}; continuing from {path}, step {state['step']}", file=sys.stderr)
             (out / CHECKPOINT).unlink()  # else the next checkpoint would push it to the place of the good one
@@ -69,3 +70,13 @@ def restore(
     if damage:
         raise ValueError(f"{damage}: delete it{f' and {PREVIOUS}' if len(found) > 1 else ''} to start over")
     return 0, {}
+
+
+def _load(state: dict[str, Any], method: Method, optimiser: torch.optim.Optimizer, num_steps: int) -> None:
+    method.load_state_dict(state["method"])
+    optimiser.load_state_dict(state["optimiser"])
+    if not all(isinstance(x, Tensor) for kept in optimiser.state.values() for x in kept.values()):
+        raise ValueError("a state of the optimiser that is no tensor")
+    step, kept = state["step"], state["validation"]
+    if type(step) is not int or not 0 <= step <= num_steps or not isinstance(kept, dict):
+        raise ValueError(f"step {step!r} of {num_steps}")

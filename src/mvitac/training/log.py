@@ -156,7 +156,10 @@ def read_log(run: Path) -> list[dict[str, Any]]:
             entry = parse_json(line)
         except ValueError:
             break
-        if not isinstance(entry, dict) or not isinstance(entry.get("step"), int):
+        scores = entry.get("eval", {}) if isinstance(entry, dict) else None
+        if not isinstance(scores, dict) or not isinstance(entry.get("step"), int):
+            break
+        if not all(isinstance(x, int | float) for x in {**entry, **scores, "eval": 0, "verdict": 0}.values()):
             break
         entries.append(entry)
     return entries

@@ -77,7 +77,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
         how = "one view of each image: choose --positives same-touch-pairs"
         raise ValueError(f"positives_within has no effect on method {run.method.name}, {how}")
     step = Step(run, method, device, world)
-    done, validation = checkpoint.restore(out, run, method, step.optimiser, world)
+    done, validation = checkpoint.restore(out, run, method, step.optimiser, run.num_steps(len(rows)), world)
     with nullcontext() if quiet or not world.is_main else shown():
         locked = _locked_features(run, pack, method, world)
     views = StepViews(run, pack, method.views, device, world, locked)
