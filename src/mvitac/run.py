@@ -210,10 +210,7 @@ class Run:
 
 
 def load_run(path: Path) -> tuple[Run, dict[str, Any]]:
-    """Read a run.json, or that in the folder of a run: the ``Run`` and the whole record.
-
-    ValueError names the file and the field that is wrong.
-    """
+    """The ``Run`` and the whole record of a run.json, or of a run's folder; ValueError names the file and the field."""
     file = path / "run.json" if path.is_dir() else path
     record = read_json(file, "a run's record")
     if not isinstance(record, dict) or "run" not in record:

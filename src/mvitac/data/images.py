@@ -137,8 +137,7 @@ ROS_CHANNELS = {"mono": 1, "8UC1": 1, "16UC1": 1, "32FC1": 1, "bgr": 3, "rgb": 3
 def ros_pixels(message: Any, name: str) -> bytes | np.ndarray:
     """The file in a sensor_msgs CompressedImage, or the numbers [H, W, 1 or 3] of an Image, red first.
 
-    Raises:
-        ValueError: ``name`` has an encoding that is not read, or a wrong length.
+    ValueError says that ``name`` has an encoding that is not read, or a wrong length.
     """
     if not hasattr(message, "encoding"):
         return bytes(message.data)

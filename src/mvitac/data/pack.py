@@ -221,11 +221,7 @@ class Pack:
 
     @functools.cached_property
     def presses(self) -> np.ndarray:
-        """int64 [N], number of each row's press (column press): its rows are of one spot, through several sensors.
-
-        Raises:
-            ValueError: If the pack has no such column.
-        """
+        """int64 [N], number of each row's press: of one spot, through several sensors. ValueError without that column."""
         if "press" not in self.table.column_names:
             raise ValueError("the table has no column press: simulate with --data.sensors-per-press 2")
         return np.unique(self.column("press").astype(str), return_inverse=True)[1]

@@ -21,7 +21,7 @@ def check_table(table: pa.Table, spec: DataSpec) -> None:
     check_known("column", ("id", "group", "split", *asked), table.column_names)
     for name in ("id", "group", "split", "touch_group", *labels):
         if name in table.column_names and table.column(name).null_count:
-            row = _first(table.column(name).is_null().to_numpy())
+            row = table.column(name).is_null().to_numpy().argmax()  # the first
             raise ValueError(f"column {name} is empty in row {row}: every row needs one")
     for name in (f"has_{modality}" for modality in spec.modalities):
         if name in table.column_names and (table.column(name).null_count or table.column(name).type != pa.bool_()):
@@ -35,7 +35,7 @@ def check_table(table: pa.Table, spec: DataSpec) -> None:
             raise ValueError(f"column {name} holds {column.type}: a label is 0 to {num - 1}, or -1 for none")
         values = column.to_numpy()
         if (bad := (values < -1) | (values >= num)).any():
-            row = _first(bad)
+            row = bad.argmax()
             raise ValueError(f"{name} is {values[row]} in row {row}: give 0 to {num - 1}, or -1 for none")
     for name in controls:
         _check_numbers(table.column(name), name, "a control needs a number in every row", gaps=False)
@@ -46,14 +46,10 @@ def check_table(table: pa.Table, spec: DataSpec) -> None:
             raise ValueError(f"id {one!r} occurs twice: give every sample its own")
 
 
-def _first(bad: np.ndarray) -> int:
-    return int(np.flatnonzero(bad)[0])
-
-
 def _check_numbers(column: pa.ChunkedArray, name: str, need: str, *, gaps: bool) -> None:
     kind = column.type
     if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
         raise ValueError(f"column {name} holds {kind}: {need}")
     values = column.to_numpy(zero_copy_only=False).astype(float)
     if (bad := np.isinf(values) if gaps else ~np.isfinite(values)).any():
-        raise ValueError(f"column {name} is {values[_first(bad)]} in row {_first(bad)}: {need}")
+        raise ValueError(f"column {name} is {values[bad.argmax()]} in row {bad.argmax()}: {need}")

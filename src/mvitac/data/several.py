@@ -241,13 +241,10 @@ class JoinedPack(_Several):
 
     Tasks are those that both packs have (of ``names``), with the classes of ``learn``. ValueError if there is none, or the
     packs have other image shapes, classes that ``learn`` lacks, or a group or an image in both.
-
-    Attributes:
-        learn: The first pack; its rows come first.
     """
 
     def __init__(self, learn: Pack, score: Pack, names: Collection[str] = ()) -> None:
-        self.path, self.meta, self.learn, self.size = score.path, score.meta, learn, learn.size
+        self.path, self.meta, self.size = score.path, score.meta, learn.size
         self.digests = {"learn": learn.digest, "score": score.digest}
         for modality in MODALITIES:
             shapes = [(pack.size, pack.spec.channels(modality)) for pack in (learn, score)]

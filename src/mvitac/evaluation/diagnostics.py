@@ -9,19 +9,13 @@ from torch import Tensor
 
 
 def spread(z: Float[Tensor, "N D"]) -> float:
-    """Mean per-dimension std of L2-normalised features, times sqrt(D): about 1 = spread out, 0 = collapsed.
-
-    Source: https://arxiv.org/abs/2011.10566 (SimSiam, section 4.1).
-    """
+    """Mean std per dimension of L2-normalised features, times sqrt(D): 1 spread out, 0 collapsed (arXiv:2011.10566, 4.1)."""
     z = F.normalize(z.float(), dim=1)
     return float(z.std(dim=0).mean() * z.shape[1] ** 0.5)
 
 
 def rank_me(z: Float[Tensor, "N D"]) -> float:
-    """Effective rank, exp of the entropy of the singular values: 1 = collapsed, at most min(N, D).
-
-    Source: https://arxiv.org/abs/2210.02885 (RankMe, eq. 2).
-    """
+    """Effective rank, exp of the entropy of singular values: 1 (collapsed) to min(N, D); arXiv:2210.02885, eq. 2."""
     p = torch.linalg.svdvals(z.double())
     p = p / p.sum().clamp(min=1e-12)
     return float(torch.exp(-(p * torch.log(p + 1e-12)).sum()))

@@ -88,9 +88,6 @@ class DINO(Contrastive, config=DINOConfig):
         self.register_buffer("centre", torch.zeros(len(self.towers), config.out))
         self.pending: Tensor | None = None
 
-    def queries(self, batch: Views) -> Embeddings:
-        return {("student", m, i): t(batch.images[m][i]) for m, t in present(self.towers, batch) for i in (0, 1)}
-
     def keys(self, batch: Views) -> Embeddings:
         return {("teacher", m, i): t(batch.images[m][i]) for m, t in present(self.teacher, batch) for i in (0, 1)}
 
@@ -98,10 +95,10 @@ class DINO(Contrastive, config=DINOConfig):
         config, losses, means = self.config, {}, []
         with torch.autocast(self.centre.device.type, enabled=False):
             for m, centre in zip(self.towers, self.centre, strict=True):
-                if ("student", m, 0) not in z:
+                if (m, 0) not in z:
                     means.append(centre)  # after_step leaves it where it is
                     continue
-                s = [z["student", m, i].float() / config.student_temperature for i in (0, 1)]
+                s = [z[m, i].float() / config.student_temperature for i in (0, 1)]
                 raw = [z["teacher", m, i].float() for i in (0, 1)]
                 t = [(scores - centre) / config.teacher_temperature for scores in raw]
                 losses[m] = (agreement(s[0], t[1]) + agreement(s[1], t[0])) / 2

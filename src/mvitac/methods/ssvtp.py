@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
-from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
+from mvitac.methods.base import Contrastive, Embeddings, MethodConfig
 from mvitac.nn.encoders import Encoders, build_towers
 from mvitac.nn.losses import info_nce
 
@@ -42,12 +42,9 @@ class SSVTP(Contrastive, config=SSVTPConfig):
         self.config = config
         self.towers = build_towers(encoder, spec, lambda width: nn.Linear(width, config.out))
 
-    def queries(self, batch: Views) -> Embeddings:
-        return {m: tower(batch.images[m][0]) for m, tower in self.towers.items()}
-
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
-        vt = info_nce(z["vision"], z["touch"], self.config.temperature)
-        tv = info_nce(z["touch"], z["vision"], self.config.temperature)
+        vt = info_nce(z["vision", 0], z["touch", 0], self.config.temperature)
+        tv = info_nce(z["touch", 0], z["vision", 0], self.config.temperature)
         return {"loss": (vt + tv) / 2, "vt": vt, "tv": tv}
 
     def projectors(self) -> dict[str, nn.Module]:

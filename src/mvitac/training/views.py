@@ -42,10 +42,7 @@ class StepViews:
         self.chunks_per_process = share // (run.chunk or share)
 
     def iterate(self, batches: Batches, start: int, num_steps: int) -> Iterator[list[Chunk]]:
-        """The chunks of each step from ``start`` to ``num_steps``.
-
-        One chunk that is slow to make, or needed on a GPU, is made while the one before is used.
-        """
+        """The chunks of each step; a single one that is slow to make, or for a GPU, is made while the last is used."""
         steps = (self(batches[step], step) for step in range(start, num_steps))
         slow = self.device.type == "cuda" or any(isinstance(images, Lazy) for images in self.pack.images.values())
         if self.chunks_per_process > 1 or not slow:

@@ -65,10 +65,7 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
 
 
 class Residuals:
-    """What is specific to each thumbnail.
-
-    It is brightness minus a sensor's median thumbnail (gel background, fixed scene), minus its blur (unsteady lamps).
-    """
+    """Brightness of thumbnails minus the sensor's median (gel background, fixed scene), minus its blur (unsteady lamps)."""
 
     def __init__(self, one: ImageStats, sensors: np.ndarray) -> None:
         self.sensors = sensors

@@ -38,10 +38,9 @@ def find(table: Manifest, vision: str | None, touch: tuple[str, ...]) -> tuple[s
 def backgrounds(
     table: Manifest, touch: Sequence[str], columns: Sequence[str], sensor: str | None, empty: Sequence[bool] | None
 ) -> list[Background]:
-    """Return the background of each row.
+    """Return the background of each row: in ``columns``, one per column of ``touch``.
 
-    It is in ``columns``, one per column of ``touch``. If ``empty`` says which rows show no
-    contact, it is the first of these of the row's ``sensor``.
+    If ``empty`` says which rows show no contact, it is the first of these of the row's ``sensor``.
     """
     if empty is None:
         if len(columns) != len(touch):
