@@ -170,16 +170,13 @@ def with_method(run: Run, method: str) -> Run:
 
 
 def recipe(name: str, data: DatasetConfig | Pack | None = None, phased: bool | None = None) -> Run:
-    """Return the named recipe as a ``Run``.
+    """Return the named recipe as a ``Run``; ValueError if there is none of this name.
 
     Args:
         name: One of ``RECIPES``: paper, authors, modern, quick, locked, smoke.
         data: Dataset to train on, or an open pack. Default: simulated touches of materials, as in `mvitac demo`.
         phased: Whether rows of a touch group show the phases of a grasp. They are then not each other's positives, and
             views are not grayscale. Default: what the data says (``Pack.phased``), opened if needed.
-
-    Raises:
-        ValueError: If there is no such recipe.
 
     Examples:
         >>> recipe("quick").data.name

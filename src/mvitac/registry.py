@@ -71,7 +71,6 @@ def find(kind: type[T], name: str) -> type[T]:
 
 
 def default(kind: type[T], name: str) -> T:
-    """Return an instance of the class registered under ``name``, with default values."""
     return find(kind, name)()
 
 

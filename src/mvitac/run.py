@@ -146,10 +146,7 @@ class Run:
         return num_rows // self.batch_size
 
     def check(self, spec: DataSpec, num_rows: int, stored_size: int) -> None:
-        """Raise ValueError unless the settings fit each other and the data, before training starts.
-
-        ``num_rows`` is the number of training rows, ``stored_size`` the side in pixels of the pack's images.
-        """
+        """ValueError unless the settings fit each other, ``num_rows`` rows to train on and images of ``stored_size`` px."""
         if num_rows < self.batch_size:
             what = f"dataset {spec.name!r} has {num_rows} rows to train on, batch_size is {self.batch_size}"
             raise ValueError(f"{what}: give --batch-size {num_rows} or less" if num_rows > 1 else f"{what}: too few")

@@ -136,7 +136,6 @@ class DataSpec:
 
     @property
     def all_tasks(self) -> tuple[AnyTask, ...]:
-        """Tasks with classes, then tasks with values."""
         return (*self.tasks, *self.values)
 
     @property
@@ -153,7 +152,6 @@ class DataSpec:
 
     @property
     def modalities(self) -> tuple[str, ...]:
-        """The modalities this dataset has, in the order of ``MODALITIES``."""
         return tuple(m for m in MODALITIES if self.channels(m))
 
 

@@ -4,6 +4,7 @@ Nothing is chosen on test rows: regularisation is chosen on split val, or on gro
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -83,11 +84,9 @@ def scorable(pack: Pack, modality: str = "none") -> list[AnyTask]:
     """The tasks of ``pack`` that have labelled rows with ``modality`` in train and test."""
     found = []
     for task in pack.spec.all_tasks:
-        try:
+        with suppress(ValueError):
             split_rows(pack, task, modality)
-        except ValueError:
-            continue
-        found.append(task)
+            found.append(task)
     return found
 
 

@@ -93,11 +93,9 @@ class Method(nn.Module, ABC):
 
         Called once, after the weights are initialised and before a checkpoint is loaded.
         """
-        return
 
     def learn_scale(self, values: dict[str, Tensor]) -> None:
         """Take mean and standard deviation of ``values``, those of all training rows. Called once, after ``prepare``."""
-        return
 
     def after_step(self, progress: float) -> None:
         """Run the updates that follow the optimiser's step, e.g. of a momentum encoder.
@@ -105,7 +103,6 @@ class Method(nn.Module, ABC):
         Values it needs from the batch are left by ``forward`` in the attribute ``pending``, which ``forward`` itself
         never reads. ``progress`` is the share of the run that is done, from 0 to 1.
         """
-        return
 
 
 class Contrastive(Method):

@@ -1,7 +1,9 @@
 """A contact sheet of a pack, to check the data by eye: the suspicious rows, and a few pairs of each class or object."""
 
 import textwrap
+from collections import defaultdict
 from collections.abc import Sequence
+from itertools import count
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -49,12 +51,9 @@ def samples(pack: Pack) -> list[Block]:
 def _spread(rows: np.ndarray, groups: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Draw ``NUM_SAMPLE`` of ``rows``, one of every group before a second of any."""
     order = rng.permutation(len(rows))
-    turns: dict[int, int] = {}
-    keys = []
-    for group in groups[order].tolist():
-        keys.append(turns.get(group, 0))
-        turns[group] = keys[-1] + 1
-    return rows[order[np.argsort(keys, kind="stable")][:NUM_SAMPLE]]
+    turns: defaultdict[int, count[int]] = defaultdict(count)
+    turn = [next(turns[group]) for group in groups[order].tolist()]
+    return rows[order[np.argsort(turn, kind="stable")][:NUM_SAMPLE]]
 
 
 def _tiles(pack: Pack, rows: Sequence[int] | np.ndarray) -> list[Tile]:

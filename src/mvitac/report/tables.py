@@ -30,10 +30,7 @@ def probe_name(kind: str, score: str) -> str:
 
 
 def print_summary(result: dict[str, Any], file: TextIO | None = None, *, probe: str = "linear") -> None:
-    """Print one table per task: accuracy or R2 in percent, mean and 95 % interval. Values have a table of targets too.
-
-    ``file``: where to, default stdout; likewise below.
-    """
+    """Print one table per task: accuracy or R2 in percent, mean and 95 % interval. Values have a table of targets too."""
     trained, by, few = [], result["group_by"], 10
     for name, task in result["summary"].items():
         trained += [{"source": s, "seed": seed} for m in task.values() for s, v in m.items() for seed in v["seeds"]]

@@ -73,7 +73,5 @@ def area_means(images: np.ndarray, side: int) -> np.ndarray:
     for axis in (1, 2):
         edges = np.linspace(0, images.shape[axis], side + 1).astype(int)
         sums = np.add.reduceat(sums, edges[:-1], axis=axis)
-        shape = [1, 1, 1, 1]
-        shape[axis] = side
-        sums /= np.diff(edges).reshape(shape)
+        sums /= np.diff(edges).reshape(side, *[1] * (3 - axis))
     return sums.round().astype(np.uint8)
