@@ -251,7 +251,8 @@ class Model(nn.Module):
         asked = "both" if len(given) == 2 else next(iter(given))
         chosen = [r for r in self.probes.values() if r.info.modality == asked]
         if not chosen:
-            raise ValueError(f"this model has no probe on {asked}: load an artifact written by `mvitac publish`")
+            how = "load an artifact that `mvitac publish` wrote with labelled data"
+            raise ValueError(f"this model has no probe on {asked}: {how}")
         return {r.info.task: r(torch.cat([given[m].cpu() for m in r.info.modalities], dim=1)) for r in chosen}
 
     @property
@@ -267,7 +268,7 @@ class Model(nn.Module):
     def open_data(self, *, quiet: bool = False) -> Pack:
         """Open the data that the model was trained on; ValueError if it is not here, or ``foreign`` names its place."""
         if self.foreign and self.run.data.names_a_place:
-            raise ValueError("an artifact may be a stranger's: its data is not opened by its path, give --on PACK")
+            raise ValueError("an artifact may be a stranger's: its data is not opened by its path, probe it --on PACK")
         return self.run.data.open(quiet=quiet)
 
     def weights_digest(self) -> str:

@@ -25,7 +25,9 @@ def paper(data: DatasetConfig, phased: bool) -> Run:
 
 
 def authors(data: DatasetConfig, phased: bool) -> Run:
-    """The settings of the authors' released code (github.com/ligerfotis/mvitac at a5b572d), without its defects.
+    """The settings of the authors' released code, without its defects.
+
+    The code is https://github.com/ligerfotis/mvitac at commit a5b572d.
 
     Differences from `paper`: lr 1e-3 with weight decay 1e-6 and StepLR, which first decays at epoch 20; wide heads with
     dropout; a random first convolution for stacked gels; flips with an effective probability of 25 %; grayscale also for

@@ -60,7 +60,8 @@ def check_range(config: object, low: float, high: float, *names: str) -> None:
     """ValueError unless the numbers ``names`` of ``config`` are finite and from ``low`` to ``high``."""
     for name in names:
         if not (low <= (value := getattr(config, name)) <= high and math.isfinite(value)):
-            raise ValueError(f"{name} {value}: give {low} {'or more' if high == math.inf else f'to {high}'}")
+            most = f"to {high}" if high < math.inf else "or more, a finite number" if value == high else "or more"
+            raise ValueError(f"{name} {value}: give {low} {most}")
 
 
 def find(kind: type[T], name: str) -> type[T]:

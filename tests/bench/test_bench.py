@@ -152,6 +152,7 @@ def test_the_result_says_what_it_is_of(results: list[Path], smoke_run: Path) -> 
     by_hand = {key: part for key, part in json.loads(results[0].read_text()).items() if key not in ("digest", "about")}
     assert value["digest"] == digest(by_hand) and value["format"] == FORMAT
     other = read_result(results[1])["encoder"]
+    assert other["parameters"]["touch"] == other["external"]["encoders"]["touch"]["parameters"]
     assert other["images_seen"] == 0 and other["trained_on"] == "nothing" and "random" in other["name"]
     assert not any(leak for block in read_result(results[1])["blocks"] for leak in block.get("leaks", ()))
     given = describe([model], [str(smoke_run)], About(name="mine", licence="MIT"))

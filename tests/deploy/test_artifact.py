@@ -48,6 +48,8 @@ def test_the_card_names_what_encoders_and_what_probes_learned_from(artifact: Pat
     assert "| majority |" in written
     assert "Encoders and probes: toy; source: tests/support/toy.py; licence: none." in card(model, manifest)
     assert "pre-trained without labels" in " ".join(card(model, manifest).split())
+    bare = card(model, manifest | {"scores": manifest["scores"] | {"summary": {}}})
+    assert "probes on" not in bare and "model.embed(" in bare and "model.predict(" in written
     manifest["data"] = {"name": "other", "licence": "CC-BY", "source": "others"}
     model.tasks = ("pattern",)  # as a supervised method leaves behind
     text = " ".join(card(model, manifest).split())
@@ -63,6 +65,8 @@ def test_the_part_of_images_is_that_of_the_data_of_the_probes(smoke_run: Path, p
     publish(smoke_run, tmp_path / "a", with_columns(pack, spec=replace(pack.spec, crop=part)), allow_leak=True)
     assert mvitac.load(tmp_path / "a").spec.crop == part
     assert with_probes(load(smoke_run), with_columns(pack, spec=replace(pack.spec, crop=part))).spec.crop == part
+    with pytest.raises(ValueError, match="has labelled rows of no task in train and test: leave --on out"):
+        publish(smoke_run, tmp_path / "b", with_columns(pack, split=["train"] * pack.num), allow_leak=True)
 
 
 def test_an_artifact_has_one_set_of_weights(artifact: Path) -> None:

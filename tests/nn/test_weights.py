@@ -188,3 +188,7 @@ def test_a_file_of_objects_is_not_run(tmp_path: Path) -> None:
             read_tensors(tmp_path / name)
     torch.save({"a": {"b": Tensor([1.0])}, "c": 3}, tmp_path / "w.pth")
     assert list(read_tensors(tmp_path / "w.pth")) == ["a.b"]
+    whole, number = (tmp_path / "w.pth").read_bytes(), bytes(Tensor([1.0]).numpy())
+    (tmp_path / "w.pth").write_bytes(whole.replace(number, bytes(Tensor([1.5]).numpy())))
+    with pytest.raises(ValueError, match="pth is damaged"):
+        read_tensors(tmp_path / "w.pth")

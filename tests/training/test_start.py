@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import safetensors.torch
+import timm
 import torch
 from safetensors.torch import save_file
 
@@ -18,7 +19,7 @@ from mvitac.evaluation.leaks import read_sources
 from mvitac.methods.byol import BYOLConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.model import fresh, load
-from mvitac.nn.encoders import PerFrame, build_trunk
+from mvitac.nn.encoders import EncoderConfig, Encoders, PerFrame, build_trunk
 from mvitac.nn.initial import Init
 from mvitac.nn.momentum import Momentum
 from mvitac.nn.weights import _say, adapt_stem
@@ -120,6 +121,14 @@ def test_digest_is_that_of_the_content(pack: Pack, smoke_run: Path, artifact: Pa
     state["encoders.touch.conv1.0.weight"][0, 0, 0, 0] += 1e-6
     safetensors.torch.save_file(state, tmp_path / "copy.safetensors")
     assert smoke(pack, init=Init(path=Path(copied))).digest() not in digests
+
+
+def test_weights_that_give_no_finite_numbers_are_refused(pack: Pack, tmp_path: Path) -> None:
+    state = timm.create_model("test_resnet").state_dict()
+    torch.save({n: -v - 1 if n.endswith("running_var") else v for n, v in state.items()}, tmp_path / "w.pth")
+    encoder = EncoderConfig(trunk="test_resnet", weights=str(tmp_path / "w.pth"))
+    with pytest.raises(ValueError, match=r"test_resnet .*its features are NaN or infinite: look at its weights"):
+        train(smoke(pack, encoder=Encoders(vision=encoder, touch=encoder)), tmp_path / "r", quiet=True)
 
 
 def test_killed_and_resumed_equals_straight(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:

@@ -7,6 +7,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from torch import nn
+
 from mvitac.bench.check import GUESS, wrong_name
 from mvitac.bench.external import ExternalModel
 from mvitac.bench.external.adapters import NOTHING
@@ -110,8 +112,12 @@ def describe(models: Sequence[Model], places: Sequence[str], about: About) -> di
         "size": max(model.image_sizes(m)[0] for m in model.encoders),
         "seeds": seeds,
         "weights": weights,
-        "parameters": {m: sum(p.numel() for p in trunk.parameters()) for m, trunk in model.encoders.items()},
+        "parameters": {m: _num_weights(trunk) for m, trunk in model.encoders.items()},
     }
+
+
+def _num_weights(trunk: nn.Module) -> int:
+    return sum(p.numel() for p in trunk.parameters() if p.is_floating_point())  # not ``ExternalEncoder.identity``
 
 
 def _of_external(model: ExternalModel) -> dict[str, Any]:

@@ -9,13 +9,13 @@ from torch import Tensor
 
 
 def spread(z: Float[Tensor, "N D"]) -> float:
-    """Mean std per dimension of L2-normalised features, times sqrt(D): 1 spread out, 0 collapsed (arXiv:2011.10566, 4.1)."""
+    """Mean std per dimension of L2-normalised features, times sqrt(D): 1 spread out, 0 collapsed (SimSiam, 2011.10566)."""
     z = F.normalize(z.float(), dim=1)
     return float(z.std(dim=0).mean() * z.shape[1] ** 0.5)
 
 
 def rank_me(z: Float[Tensor, "N D"]) -> float:
-    """Effective rank, exp of the entropy of singular values: 1 (collapsed) to min(N, D); arXiv:2210.02885, eq. 2."""
+    """Effective rank (RankMe, arXiv:2210.02885, eq. 2), exp of the entropy of singular values: 1 to min(N, D)."""
     p = torch.linalg.svdvals(z.double())
     p = p / p.sum().clamp(min=1e-12)
     return float(torch.exp(-(p * torch.log(p + 1e-12)).sum()))

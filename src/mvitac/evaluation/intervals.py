@@ -150,7 +150,8 @@ def _over_groups(correct: np.ndarray, sizes: np.ndarray) -> _Variance:
     zero, one, two = (float((share * w**power).sum()) for power in range(3))
     off = (squares * zero) ** 2 + 2 * zero * two - 4 * squares * zero * one + 2 * one**2
     trace = off + float((share**2 * (1 + 2 * squares - 4 * w)).sum())
-    return _Variance(float(share @ residuals**2), squares**2 / trace if trace else 1.0)  # 0: one group is all
+    known = trace > squares**2 / len(sizes)  # else rounding is all that is left of it, as one group is nearly all
+    return _Variance(float(share @ residuals**2), max(1.0, squares**2 / trace) if known else 1.0)
 
 
 def _skewness_term(variance: _Variance, shares: np.ndarray, sizes: np.ndarray) -> float:

@@ -133,8 +133,7 @@ def summarise(records: Sequence[dict[str, Any]], probe: str = "linear") -> dict[
     for (task, modality, source), found in by_cell(records, probe).items():
         mean, low, high = interval(found)
         seeds = [record["seed"] for record in found if record["seed"] is not None]
-        ends = {"low": low if math.isfinite(low) else None, "high": high}  # JSON has no infinity
-        cell: dict[str, Any] = {"mean": mean, **ends, "seeds": seeds}
+        cell: dict[str, Any] = {"mean": mean, "low": _finite(low), "high": high, "seeds": seeds}
         cell["groups"] = num_groups_of(found[0])
         if "targets" in found[0]:
             cell["targets"] = targets_of(found)
@@ -189,6 +188,9 @@ def targets_of(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         mean, low, high = interval([one_target(record, t) for record in records])
         errors = {key: float(np.mean([record["targets"][t][key] for record in records])) for key in ("mae", "rmse")}
         about = {"name": target["name"], "unit": target["unit"]}
-        ends = {"low": low if math.isfinite(low) else None, "high": high}
-        found.append({**about, "mean": mean, **ends, **errors})
+        found.append({**about, "mean": mean, "low": _finite(low), "high": high, **errors})
     return found
+
+
+def _finite(low: float) -> float | None:
+    return low if math.isfinite(low) else None  # JSON has no infinity

@@ -10,6 +10,7 @@ Settings are chosen on held-out groups of the labelled rows, never on test rows:
 steps. The final model learns from all of these groups. A call that is repeated with ``resume`` continues.
 """
 
+import math
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -33,7 +34,7 @@ from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import Model, fresh, load
 from mvitac.nn.encoders import IMAGENET, EncoderConfig, Encoders
 from mvitac.nn.initial import Init
-from mvitac.registry import from_json
+from mvitac.registry import check_range, from_json
 from mvitac.run import Optim, Run, load_run
 from mvitac.system.files import check_place, digest, read_json, write_json
 from mvitac.system.progress import duration
@@ -72,8 +73,10 @@ class Finetuning:
     """Go on if the model, or one it started from, was trained on test rows or groups. LEAK stands beside every score."""
 
     def __post_init__(self) -> None:
-        if not (self.lr and self.steps and self.fractions and 0 < self.seeds <= 1000 and self.batch_size > 1):
-            raise ValueError("give at least one of lr, steps, fractions, seeds (up to 1000), and batches of 2 or more")
+        for name in (name for name in ("lr", "steps", "fractions") if not getattr(self, name)):
+            raise ValueError(f"{name} is empty: give at least one")
+        check_range(self, 1, 1000, "seeds")
+        check_range(self, 2, math.inf, "batch_size")
         ProbeConfig(fractions=self.fractions, modalities=self.modalities)  # checks them
 
 

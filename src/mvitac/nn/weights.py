@@ -7,6 +7,7 @@ import argparse
 import hashlib
 import sys
 import warnings
+import zipfile
 from collections.abc import Collection, Iterable
 from functools import cache, partial
 from pathlib import Path
@@ -75,13 +76,25 @@ def read_tensors(file: Path) -> State:
     try:
         # Several owners keep their options in the file. torch warns of TorchScript.
         with torch.serialization.safe_globals([argparse.Namespace]), warnings.catch_warnings(action="ignore"):
-            found = _flat(torch.load(file, map_location="cpu", weights_only=True))
+            found = _flat(load_checked(file))
     except Exception:  # torch raises several types
         why = "is damaged, or cannot be read without running code from it: a state_dict is read, or .safetensors"
         raise ValueError(f"{file} {why}") from None
     if not found:
         raise ValueError(f"{file} holds no named weights")
     return found
+
+
+def load_checked(file: Path) -> Any:
+    """What a file of torch holds, without running code from it; an error of several types if it is damaged.
+
+    torch.save writes a zip archive, whose checksums torch.load does not compare.
+    """
+    if zipfile.is_zipfile(file):
+        with zipfile.ZipFile(file) as archive:
+            if (name := archive.testzip()) is not None:
+                raise ValueError(f"{name} does not match its checksum")
+    return torch.load(file, map_location="cpu", weights_only=True)
 
 
 def said_trained_on(file: Path) -> str:

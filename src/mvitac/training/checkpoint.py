@@ -1,15 +1,13 @@
 """checkpoint.pt, from which an interrupted run continues: weights, optimiser state, step, and the digest of the run.
 
 It is one file for any number of processes. It needs no state of random generators, since all randomness is a function of
-(seed, step). Loading it executes no code (``weights_only``). torch.save writes a zip archive, whose checksums are compared
-when it is read. The one before is kept as checkpoint.previous.pt until the run is finished, in case this is damaged.
+(seed, step). The one before is kept as checkpoint.previous.pt until the run is finished, in case this is damaged.
 """
 
 import contextlib
 import io
 import os
 import sys
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ import torch
 from torch import Tensor
 
 from mvitac.methods.base import Method
+from mvitac.nn.weights import load_checked
 from mvitac.run import Run
 from mvitac.system.distributed import World
 from mvitac.system.files import brief, write_atomic
@@ -52,10 +51,7 @@ def restore(
     found, damage = [path for path in (out / CHECKPOINT, out / PREVIOUS) if path.exists()], ""
     for path in found:
         try:
-            with zipfile.ZipFile(path) as archive:
-                if (name := archive.testzip()) is not None:
-                    raise ValueError(f"{name} does not match its checksum")
-            state = torch.load(path, map_location="cpu", weights_only=True)
+            state = load_checked(path)
             if mine := state["run"] == run.digest():
                 _load(state, method, optimiser, num_steps)
         except Exception as error:  # zipfile and torch raise several types for damaged files

@@ -1,5 +1,6 @@
 """What happens before the first step, in the order of ``set_up``: data, precision, method, checkpoint, locked features."""
 
+import math
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -252,12 +253,14 @@ def _locked_features(run: Run, pack: Pack, method: Method, world: World) -> dict
 
 
 def _check_image_size(method: Method, run: Run, pack: Pack) -> None:
-    """Pass two blank images through each trunk, because not every trunk supports every image size."""
+    """Pass two images through each trunk: not every one supports every size, or has weights that give finite numbers."""
     model = Model(method, run, pack.spec, pack.size)
     for modality, trunk in model.encoders.items():
         shape, device = (2, pack.spec.channels(modality), pack.size, pack.size), next(trunk.parameters()).device
+        images = (torch.arange(math.prod(shape), device=device) % 256).to(torch.uint8).view(shape)
         try:
-            model.features(modality, torch.zeros(shape, dtype=torch.uint8, device=device))
+            if not model.features(modality, images).isfinite().all():
+                raise ValueError("its features are NaN or infinite: look at its weights")
         except Exception as error:  # the type differs between trunks
             given = f"trunk {run.encoder[modality].trunk} cannot take images of {model.image_sizes(modality)[0]} px"
             raise ValueError(f"{given} ({brief(error)}): give another --augment.size or --encoder.trunk") from None
