@@ -29,10 +29,7 @@ def cells(file: Path) -> list[tuple[str, str]]:
 
 
 def run(page: Path, folder: Path, names: dict[str, Any] | None = None) -> None:
-    """Run the code cells of ``page`` in ``folder``. Its commands run in this process: each would import torch.
-
-    Cells define their ``names`` in ``__main__`` by default, as those of a notebook do.
-    """
+    """Run the cells of ``page`` in ``folder`` and this process; their ``names`` are those of ``__main__`` by default."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         run_cells(page, vars(sys.modules["__main__"]) if names is None else names)

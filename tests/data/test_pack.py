@@ -343,22 +343,23 @@ def test_rows_of_one_task_alone_are_hidden_from_all_else(pack: Pack) -> None:
 
 
 SLOW = """
-import os, time
+import os, signal, time
 from mvitac.data.build import build
 from support.toy import Toy
 
 class Slow(Toy):
     def read(self, item):
-        print("it reads", flush=True)
+        os.write(1, b"it reads\\n")
         time.sleep(600)
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a script's background job ignores it
     try:
         build(Slow(), "p", size=32, workers=2, quiet=True)
     except KeyboardInterrupt:
         pass
 else:
-    print("a worker starts", flush=True)
+    os.write(1, b"a worker starts\\n")  # at once, or the lines of two would mix
     time.sleep(1)
 """
 

@@ -24,10 +24,7 @@ def wrench(time: float, fz: float) -> Any:
 
 
 def write_bag(path: Path, plugin: StoragePlugin, number: int, pixels: Any = None) -> Path:
-    """2 s: the gel at 25 Hz (blue = frame), the camera at 10 Hz, force at 100 Hz (Fz = 3 t); received 1 to 30 ms late.
-
-    With ``pixels``, a depth, both show it.
-    """
+    """2 s: gel at 25 Hz (blue = frame) and camera at 10 Hz, or a depth ``pixels``; Fz = 3 t at 100 Hz; 1 to 30 ms late."""
     rng, messages = np.random.default_rng(number), []
     for i in range(50):
         frame = np.zeros((16, 20, 3), np.uint8) if pixels is None else pixels

@@ -102,10 +102,7 @@ def step(folder: Path) -> None:
 
 
 def train(place: str, out: Path, die_after: int) -> None:
-    """The whole loop; every process dies after its ``die_after``-th batch, and notes the rows it saw.
-
-    ``place`` is a pack.
-    """
+    """The whole loop on a pack; every process dies after its ``die_after``-th batch, and notes the rows it saw."""
     real, seen = StepViews.make, []
 
     def watched(self: StepViews, rows: np.ndarray, seed: int) -> object:

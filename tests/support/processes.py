@@ -27,10 +27,7 @@ def _work(work: Callable[..., int | None], args: tuple[Any, ...], output: str, e
 def begin(
     work: Callable[..., int | None], *args: Any, output: Path | str = os.devnull, **environment: str
 ) -> BaseProcess:
-    """``work(*args)`` in a new process, under this one's environment and ``environment``; it prints into ``output``.
-
-    Its exitcode is what ``work`` returns, 0 for None, 1 after an exception, -9 after SIGKILL.
-    """
+    """``work(*args)`` in a new process, under this one's environment and ``environment``; it prints into ``output``."""
     process = CONTEXT.Process(target=_work, args=(work, args, str(output), {**os.environ, **environment}))
     process.start()
     return process

@@ -107,14 +107,11 @@ def test_a_checkpoint_of_other_kinds_gives_way_to_the_one_before(pack: Pack, tmp
         assert restore(tmp_path, run, method, optimiser, 8)[0] == 2, (where, value)
 
 
-LINES = "[]", '{"step": 4, "loss": {}}', '{"step": 4, "eval": null}', '{"step": 4, "eval": {"a": []}}'
-
-
-@pytest.mark.parametrize("line", LINES)
-def test_a_log_ends_before_what_is_none(line: str, tmp_path: Path) -> None:
+def test_a_log_ends_before_what_is_none(tmp_path: Path) -> None:
     good = '{"step": 0, "eval": {}, "verdict": "x"}', '{"step": 2, "loss": 1}'
-    (tmp_path / "log.jsonl").write_text("\n".join([*good, line]))
-    assert [entry["step"] for entry in read_log(tmp_path)] == [0, 2]
+    for bad in ("[]", '{"step": 4, "loss": {}}', '{"step": 4, "eval": null}', '{"step": 4, "eval": {"a": []}}'):
+        (tmp_path / "log.jsonl").write_text("\n".join([*good, bad]))
+        assert [entry["step"] for entry in read_log(tmp_path)] == [0, 2], bad
 
 
 def test_killed_between_two_checkpoints(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:

@@ -156,7 +156,8 @@ def _end_with_parent() -> None:
 def _start_worker(file: str) -> None:
     global _reader
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # ends without a traceback
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # which a script's background job has
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # ends without a traceback
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     keep_freed_memory()
     _reader = pickle.loads(Path(file).read_bytes())

@@ -68,11 +68,9 @@ class Plan:
     def __post_init__(self) -> None:
         labels = [row.label for row in self.rows]
         check_range(self, 1, 1000, "seeds")
-        given = {name for each in (self.set, *(row.set for row in self.rows)) for name in each}
-        if "seed" in given:
-            raise ValueError("seed: runs have the seeds 0 .. seeds - 1, give their number")
-        if "device" in given:
-            raise ValueError("device: it is that of all runs, an option of compare")
+        fixed = {"seed": "runs have the seeds 0 .. seeds - 1, give their number", "device": "it is that of all runs"}
+        for name in (name for each in (self.set, *(row.set for row in self.rows)) for name in each if name in fixed):
+            raise ValueError(f"{name}: {fixed[name]}")
         if not all(slug(label) for label in labels):
             raise ValueError(f"plan {self.name!r}: a row has no label of letters or digits")
         if taken := sorted(set(labels) & set(CONTROLS)):

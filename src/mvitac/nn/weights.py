@@ -86,10 +86,7 @@ def read_tensors(file: Path) -> State:
 
 
 def load_checked(file: Path) -> Any:
-    """What a file of torch holds, without running code from it; an error of several types if it is damaged.
-
-    torch.save writes a zip archive, whose checksums torch.load does not compare.
-    """
+    """What a file of torch holds, whose checksums are right: torch.load does not compare them. No code of it is run."""
     if zipfile.is_zipfile(file):
         with zipfile.ZipFile(file) as archive:
             if (name := archive.testzip()) is not None:
