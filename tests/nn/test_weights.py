@@ -38,8 +38,6 @@ def test_a_random_stem_changes_nothing_else(weights: Path) -> None:
     assert torch.equal(three.state_dict()["conv1.0.weight"], safetensors.torch.load_file(weights)["conv1.0.weight"])
 
 
-# -- ImageNet without a network ----------------------------------------------------------------------------------------
-
 LITE = "tf_efficientnet_lite0"
 
 

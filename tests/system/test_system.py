@@ -54,6 +54,7 @@ def test_a_new_folder_is_complete_or_not_there(tmp_path: Path) -> None:
     with new_folder(tmp_path / "out") as partial:
         (partial / "file").touch()
     assert [path.name for path in tmp_path.rglob("*")] == ["out", "file"]
+    (tmp_path / "out.lock").touch()  # of a process that was killed at its very end
     with pytest.raises(ValueError, match="already exists"), new_folder(tmp_path / "out"):
         pass
     assert [path.name for path in tmp_path.rglob("*")] == ["out", "file"]

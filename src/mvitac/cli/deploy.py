@@ -71,7 +71,7 @@ class _ExportOptions(ExportConfig):
 def export(argv: list[str]) -> None:
     options = parse(_ExportOptions, argv, "export")
     check_models(options.model)
-    check_new(options.out)
+    check_new(options.out, lock=True)
     loading()
     from mvitac.deploy.artifact import load
     from mvitac.deploy.export import export
