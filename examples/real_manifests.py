@@ -208,7 +208,7 @@ MANIFESTS |= {wedge_force_pairs: "wedge_force", tactip_rigs: "tactip_shear", tac
 
 if __name__ == "__main__":
     if len(sys.argv) != 3 or not Path(sys.argv[1]).is_dir():
-        sys.exit(f"usage: python {sys.argv[0]} DATA_FOLDER OUT_FOLDER, of which the first must be there")
+        sys.exit(f"usage: python {sys.argv[0]} DATA_FOLDER OUT_FOLDER; DATA_FOLDER must exist")
     for make, name in MANIFESTS.items():
         source = Path(sys.argv[1]) / name
         if (source / "manifest.csv").is_file():

@@ -343,7 +343,7 @@ def test_rows_of_one_task_alone_are_hidden_from_all_else(pack: Pack) -> None:
 
 
 SLOW = """
-import os, signal, time
+import os, signal, sys, time
 from mvitac.data.build import build
 from support.toy import Toy
 
@@ -353,7 +353,7 @@ class Slow(Toy):
         time.sleep(600)
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a script's background job ignores it
+    signal.signal(signal.SIGINT, signal.SIG_IGN if sys.argv[1:] else signal.default_int_handler)
     try:
         build(Slow(), "p", size=32, workers=2, quiet=True)
     except KeyboardInterrupt:
@@ -364,17 +364,23 @@ else:
 """
 
 
-@pytest.mark.parametrize(("kind", "line"), [(signal.SIGKILL, "it reads"), (signal.SIGINT, "a worker starts")])
-def test_workers_end_with_the_process_that_packs(kind: signal.Signals, line: str, tmp_path: Path) -> None:
-    """They hold its stdout: whoever reads it would wait for ever. Ctrl-C reaches those that are just starting, too."""
+@pytest.mark.parametrize("how", ["killed", "Ctrl-C at the start", "Ctrl-C ignored"])
+def test_workers_end_with_the_process_that_packs(how: str, tmp_path: Path) -> None:
+    """They hold its stdout: whoever reads it would wait for ever. Where it ignores Ctrl-C, so do they."""
+    kind = signal.SIGKILL if how == "killed" else signal.SIGINT
+    line, more = "a worker starts" if "start" in how else "it reads", ["ignore"] * ("ignored" in how)
     (tmp_path / "pack.py").write_text(SLOW)
     about: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "start_new_session": True, "text": True}
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    with subprocess.Popen([sys.executable, "pack.py"], cwd=tmp_path, env=env, **about) as packing:
+    with subprocess.Popen([sys.executable, "pack.py", *more], cwd=tmp_path, env=env, **about) as packing:
         assert packing.stdout and line in map(str.strip, packing.stdout)
         (os.kill if kind == signal.SIGKILL else os.killpg)(packing.pid, kind)
         try:
-            said = packing.communicate(timeout=60)[1]
+            said = packing.communicate(timeout=2 if more else 60)[1]
+            assert not more, said
+        except subprocess.TimeoutExpired:
+            assert more
+            said = ""
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(packing.pid, signal.SIGKILL)

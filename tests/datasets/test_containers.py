@@ -302,10 +302,7 @@ def test_hub_and_manifests_read_values(tmp_path: Path) -> None:
     values, shown = measured(packed(hub, tmp_path / "h"))
     number = np.where(shown == 104, np.nan, shown - 100)
     assert np.array_equal(values, np.stack([number / 8, number / 4], axis=1), equal_nan=True)
-    for value, why in {
-        "pose[1]:mm": "has fewer than two different",
-        "pose:mm": r"give an element, such as pose\[0",
-    }.items():
+    for value, why in (("pose[1]:mm", "has fewer than two different"), ("pose:mm", r"an element, such as pose\[0")):
         with pytest.raises(ValueError, match=why):
             FolderConfig(path=tmp_path / "hub", size=16, vision="photo", values=(value,)).source()
 

@@ -251,7 +251,7 @@ def test_data_that_changed_since_training_is_said(
     )
     assert "its data is not that of" in capsys.readouterr().err
     assert main(["export", str(run), "--out", str(tmp_path / "x")]) == 0
-    assert "changed since: probes are fitted on the new" in capsys.readouterr().err
+    assert "was trained on other data than its probes are fitted on" in capsys.readouterr().err
 
 
 def test_scores_on_val_are_not_taken_for_those_on_test(pack: Pack, tmp_path: Path) -> None:

@@ -187,7 +187,7 @@ def test_methods_of_these_plans_see_equally_many_images(pack: Pack, name: str) -
         ('reference = "a"\n[[rows]]\nlabel = "a"\ntau = 1', "unknown field in plan.rows 'tau'"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\n[[rows]]\nlabel = "A"', "two labels are one"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\nset = {seed = 3}', "runs have the seeds 0"),
-        ('reference = "a"\nset = {device = "cpu"}\n[[rows]]\nlabel = "a"', "device: it is that of all runs"),
+        ('reference = "a"\nset = {device = "cpu"}\n[[rows]]\nlabel = "a"', "device: give --device instead"),
         ('reference = "pixels"\n[[rows]]\nlabel = "pixels"', "row 'pixels' has the name of a control"),
     ],
 )

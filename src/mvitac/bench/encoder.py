@@ -7,8 +7,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from torch import nn
-
 from mvitac.bench.check import GUESS, wrong_name
 from mvitac.bench.external import ExternalModel
 from mvitac.bench.external.adapters import NOTHING
@@ -106,18 +104,16 @@ def describe(models: Sequence[Model], places: Sequence[str], about: About) -> di
         raise ValueError(f"{', '.join(places)} are not seeds of one encoder: bench them one by one")
     found = _of_external(model) if isinstance(model, ExternalModel) else _of_run(model, Path(places[0]))
     given = {key: value for key, value in vars(about).items() if value}
+    # Of floats: the wrapper of an external network keeps a digest among its parameters.
+    weighted = {m: [p for p in t.parameters() if p.is_floating_point()] for m, t in model.encoders.items()}
     return {
         **found,
         **given,
         "size": max(model.image_sizes(m)[0] for m in model.encoders),
         "seeds": seeds,
         "weights": weights,
-        "parameters": {m: _num_weights(trunk) for m, trunk in model.encoders.items()},
+        "parameters": {m: sum(p.numel() for p in own) for m, own in weighted.items()},
     }
-
-
-def _num_weights(trunk: nn.Module) -> int:
-    return sum(p.numel() for p in trunk.parameters() if p.is_floating_point())  # not ``ExternalEncoder.identity``
 
 
 def _of_external(model: ExternalModel) -> dict[str, Any]:

@@ -48,7 +48,7 @@ def warn_changed(run: str, pack: Pack) -> None:
     from mvitac.evaluation.evaluate import trained_on
 
     if trained_on(Path(run)) not in (None, pack.digest):
-        print(f"mvitac: warning: the data of {run} changed since: probes are fitted on the new", file=sys.stderr)
+        print(f"mvitac: warning: {run} was trained on other data than its probes are fitted on", file=sys.stderr)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +71,7 @@ class _ExportOptions(ExportConfig):
 def export(argv: list[str]) -> None:
     options = parse(_ExportOptions, argv, "export")
     check_models(options.model)
-    check_new(options.out, lock=True)
+    check_new(options.out, before_lock=True)
     loading()
     from mvitac.deploy.artifact import load
     from mvitac.deploy.export import export

@@ -162,11 +162,9 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
         for weight in (w for w in model.state_dict().values() if half and w.ndim > 1):
             weight.copy_(weight.half())
         _, record = load_run(run)
-        if given := pack is not None:
-            pack = as_trained(model, pack)
-        else:
+        if pack is None:
             pack = noted(own_data(model, "fit the probes on a pack, --on PACK"), [run])
-        if given and not scorable(pack):
+        elif not scorable(pack := as_trained(model, pack)):
             raise ValueError(f"{pack.path} has labelled rows of no task in train and test: leave --on out")
         learned, scores = _fit_and_score(run, model, pack, allow_leak)
         met = sensors_of(pack, pack.rows("train", "val", "unlabelled"))  # by the probes, if not by the encoders

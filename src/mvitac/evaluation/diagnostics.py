@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def spread(z: Float[Tensor, "N D"]) -> float:
-    """Mean std per dimension of L2-normalised features, times sqrt(D): 1 spread out, 0 collapsed (SimSiam, 2011.10566)."""
+    """Mean std of L2-normalised features times sqrt(D): 1 spread out, 0 collapsed (SimSiam, arXiv:2011.10566, 4.1)."""
     z = F.normalize(z.float(), dim=1)
     return float(z.std(dim=0).mean() * z.shape[1] ** 0.5)
 

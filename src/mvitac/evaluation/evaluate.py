@@ -90,9 +90,7 @@ def probe_runs(
     _check_reads([*zip(names, models, strict=True), *((model.title, model) for model, _ in others)], pack, modalities)
     if session.standardise and (others or {*modalities} <= {"vision"}):
         raise ValueError("--standardise changes the touch features of runs, not of vision or an --encoder")
-    titles, fixed = {model.title for model, _ in others}, {*CONTROLS, *pack.spec.controls}
-    if alike := titles & {*names} | (titles | {*names}) & fixed:
-        raise ValueError(f"two rows would be called {min(alike)!r}: give a title=NAME, or rename the data's control")
+    _check_names({*names}, {model.title for model, _ in others}, {*CONTROLS, *pack.spec.controls})
     for model in models:
         fitting(model, pack)
     # The initial weights that an artifact names may be any file or download.
@@ -128,6 +126,11 @@ def _check_reads(models: Sequence[tuple[str, Any]], pack: Pack, modalities: Sequ
     for name, model in models:
         if not any({*names_in(m, pack)} <= {*model.encoders} for m in modalities):
             raise ValueError(f"{name} does not read {' or '.join(modalities)}: choose other --modalities")
+
+
+def _check_names(runs: set[str], encoders: set[str], controls: set[str]) -> None:
+    if alike := encoders & runs | (encoders | runs) & controls:
+        raise ValueError(f"two rows would be called {min(alike)!r}: give a title=NAME, or rename the data's control")
 
 
 def _check_paths(paths: Sequence[Path], encoders: Sequence[str]) -> None:

@@ -68,7 +68,7 @@ class Plan:
     def __post_init__(self) -> None:
         labels = [row.label for row in self.rows]
         check_range(self, 1, 1000, "seeds")
-        fixed = {"seed": "runs have the seeds 0 .. seeds - 1, give their number", "device": "it is that of all runs"}
+        fixed = {"seed": "runs have the seeds 0 .. seeds - 1, give their number", "device": "give --device instead"}
         for name in (name for each in (self.set, *(row.set for row in self.rows)) for name in each if name in fixed):
             raise ValueError(f"{name}: {fixed[name]}")
         if not all(slug(label) for label in labels):

@@ -51,7 +51,7 @@ def new_folder(out: Path) -> Iterator[Path]:
 
     Raises Busy if another process writes ``out``, ValueError if it exists or cannot be written.
     """
-    check_new(out, lock=True)
+    check_new(out, before_lock=True)
     with hold_lock(out, f"{out} is being written by another process: wait, or choose another", wait=False) as left:
         partial = out.with_name(out.name + ".partial")
         for place in (out, *[partial] * (not left)):
@@ -66,8 +66,8 @@ def new_folder(out: Path) -> Iterator[Path]:
             shutil.rmtree(partial, ignore_errors=True)
 
 
-def check_new(place: Path, *, lock: bool = False) -> None:
-    """ValueError if ``place`` exists (but with a ``lock``, which a later check deletes), or cannot be written."""
+def check_new(place: Path, *, before_lock: bool = False) -> None:
+    """ValueError if ``place`` exists or cannot be written. ``before_lock``: whoever takes a lock left there checks again."""
     check_place(place)
-    if os.path.lexists(place) and not (lock and os.path.exists(f"{place}.lock")):
+    if os.path.lexists(place) and not (before_lock and os.path.exists(f"{place}.lock")):
         raise ValueError(f"{place} already exists: choose another place, or delete it first")

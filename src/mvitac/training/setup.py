@@ -231,7 +231,7 @@ def _build_method(
     method.prepare(torch.from_numpy(rows))
     method.learn_scale(values_of(run, pack, rows))
     method.to(device).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    _check_image_size(method, run, pack)
+    _check_trunks(method, run, pack)
     return method, taken
 
 
@@ -252,15 +252,17 @@ def _locked_features(run: Run, pack: Pack, method: Method, world: World) -> dict
     return found
 
 
-def _check_image_size(method: Method, run: Run, pack: Pack) -> None:
+def _check_trunks(method: Method, run: Run, pack: Pack) -> None:
     """Pass two images through each trunk: not every one supports every size, or has weights that give finite numbers."""
     model = Model(method, run, pack.spec, pack.size)
     for modality, trunk in model.encoders.items():
         shape, device = (2, pack.spec.channels(modality), pack.size, pack.size), next(trunk.parameters()).device
         images = (torch.arange(math.prod(shape), device=device) % 256).to(torch.uint8).view(shape)
+        what = f"trunk {run.encoder[modality].trunk}"
         try:
-            if not model.features(modality, images).isfinite().all():
-                raise ValueError("its features are NaN or infinite: look at its weights")
+            finite = model.features(modality, images).isfinite().all()
         except Exception as error:  # the type differs between trunks
-            given = f"trunk {run.encoder[modality].trunk} cannot take images of {model.image_sizes(modality)[0]} px"
-            raise ValueError(f"{given} ({brief(error)}): give another --augment.size or --encoder.trunk") from None
+            given = f"{what} cannot take images of {model.image_sizes(modality)[0]} px ({brief(error)})"
+            raise ValueError(f"{given}: give another --augment.size or --encoder.trunk") from None
+        if not finite:
+            raise ValueError(f"{what} of {modality} gives NaN or infinite features: start from other weights")

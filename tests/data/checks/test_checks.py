@@ -169,10 +169,8 @@ def test_each_fault_is_named_and_nothing_else(fault: str, tmp_path: Path) -> Non
 
 
 def test_what_the_search_for_give_aways_left_out_is_said(tmp_path: Path) -> None:
-    few, same, noise = (
-        check(Presses(kind), tmp_path / kind)["columns that give a label away"]
-        for kind in ("few labels", "another name", "noise")
-    )
+    kinds, item = ("few labels", "another name", "noise"), "columns that give a label away"
+    few, same, noise = (check(Presses(kind), tmp_path / kind)[item] for kind in kinds)
     assert few.verdict == "not checkable" and "material has 48 labelled rows outside test, 64 are" in few.evidence
     assert same.verdict == "ok" and "number says the same as material" in same.evidence
     assert noise.verdict == "ok", noise.evidence  # in 8 parts of 64 rows, noise is right for ten points more
