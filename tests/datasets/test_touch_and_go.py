@@ -227,8 +227,7 @@ def test_the_official_split_is_the_lists(official: Pack) -> None:
     assert {*found.train, *found.val} == {*np.flatnonzero(((frame < 70) | (frame >= 130)) & (place < 7))}
     found = split_rows(official, rough)
     assert set(place[found.test]) == {2, 3} and set(place[[*found.train, *found.val]]) == {0, 1, 7}
-    # Pre-training sees the owners' list and nothing else.
-    seen = official.rows("train", "unlabelled")
+    seen = official.rows("train", "unlabelled")  # pre-training sees the owners' list and nothing else
     assert len(seen) == 7 * 25 and set(frame[seen]) == {*range(20, 30), *range(130, 145)}
     # A method that learns from labels is not told those of the rough test list, whose frames it sees.
     assert (official.labels(rough.name, "train")[np.isin(place, (2, 3))] == -1).all()

@@ -409,9 +409,10 @@ def test_neighbours_are_by_cosine_and_vote_in_shares() -> None:
 
 
 def test_classes_never_seen_get_probability_zero() -> None:
-    x, y = np.array([[-1.0], [0.9], [1.0]]), np.array([0, 2, 2])  # so few that scikit-learn alone would warn
+    x, y = np.array([[-1.0], [-0.9], [0.9], [1.0]]), np.array([0, 0, 2, 2])
     found = fit_linear(x, y, x, y, 4)[0](np.array([[1.0]]))[0]
     assert found[2] > found[0] > 0 and found[[1, 3]].tolist() == [0, 0] and found.sum() == pytest.approx(1)
+    fit_linear(x := np.eye(24), y := np.arange(24) % 20, x, y)  # so few rows that scikit-learn alone would warn
 
 
 def test_the_scale_of_a_feature_does_not_matter_to_any_linear_probe() -> None:
