@@ -1,6 +1,6 @@
 """The trained model: encoders, heads into the shared space, and the preprocessing of raw images.
 
-    model = mvitac.load("runs/demo/seed0")
+    model = mvitac.load("base")
     features = model.embed(vision=photos, touch=presses)      # {"vision": [N, 1280], "touch": [N, 512]}
     features = model(touch=batch)["touch"]                    # with gradients, for fine-tuning
 

@@ -95,9 +95,9 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def results(root: Path, smoke_run: Path) -> list[Path]:
-    """Results of a trained run and of a random trunk."""
+    """Results of a trained run and of two random trunks."""
     toys, out = find_suite(str(root / "toys.toml")), root / "results"
-    places = [str(smoke_run)], [RANDOM.format(5)]
+    places = [str(smoke_run)], [RANDOM.format(5), RANDOM.format(6)]
     return [run_bench(place, toys, out, root, About()) for place in places]
 
 
@@ -154,6 +154,7 @@ def test_the_result_says_what_it_is_of(results: list[Path], smoke_run: Path) -> 
     other = read_result(results[1])["encoder"]
     assert other["parameters"]["touch"] == other["external"]["encoders"]["touch"]["parameters"]
     assert other["images_seen"] == 0 and other["trained_on"] == "nothing" and "random" in other["name"]
+    assert other["seeds"] == [5, 6] and not problems(read_result(results[1]))
     assert not any(leak for block in read_result(results[1])["blocks"] for leak in block.get("leaks", ()))
     given = describe([model], [str(smoke_run)], About(name="mine", licence="MIT"))
     assert (given["name"], given["licence"]) == ("mine", "MIT")
@@ -290,10 +291,12 @@ def all_right(value: dict[str, Any]) -> None:
     record["sums"]["correct"] = record["sums"]["n"]
 
 
-def worse_mean(value: dict[str, Any]) -> None:
-    """Errors three times as large, which no one answer has."""
+def worse_mean(factor: float, folds: int, value: dict[str, Any]) -> None:
+    """Errors ``factor`` times as large, which no answer of a fold has."""
+    value["suite"]["sets"][0]["folds"] = folds
+    value["suite_digest"] = suite_of(value).digest()
     sums = next(r["sums"] for r in value["blocks"][1]["records"] if r["source"] == "mean")
-    for name, factor in (("error", 3), ("squared_error", 9)):
+    for name, factor in (("error", factor), ("squared_error", factor**2)):
         sums[name] = [[factor * x for x in each] for each in sums[name]]
 
 
@@ -391,7 +394,10 @@ FORGED: dict[str, tuple[Change, str]] = {
     "no imagenet": (lambda value: value["blocks"][1].pop("notes"), "lacks imagenet, touch, linear, None"),
     "a truth for a count": (put(*RECORDS, 0, "sums", "correct", 0, value=True), "its sums are no numbers"),
     "all guesses right": (all_right, "one answer is right for all rows"),
-    "a worse mean": (worse_mean, "its errors are not those of one answer"),
+    "a worse mean": (partial(worse_mean, 3, 0), "its errors are not those of one answer$"),
+    "a mean of folds": (partial(worse_mean, 1.02, 3), "its errors are not those of one answer per fold"),
+    "a mean of a group": (partial(worse_mean, 9, 99), "its errors are not those of one answer per fold"),
+    "a better mean": (partial(worse_mean, 0.02, 99), "its errors are not those of one answer per fold"),
     "values of pixels": (partial(copied, "", "pixels"), "light: touch, the encoder, linear, seed 0: has the sums of"),
     "controls alike": (partial(copied, "border", "pixels"), "touch, .*, linear, seed None: has the sums of touch, "),
     "a control knows nothing": (partial(copied, "untrained", "mean"), "linear, seed 1: has the sums of mean"),
@@ -404,7 +410,7 @@ FORGED: dict[str, tuple[Change, str]] = {
     "rows in floats": (put(*RECORDS, 0, "sums", "n", 0, value=float), "its sums are no numbers"),
     "no features": (put("encoder", "features", value={}), "its features and parameters are of other senses"),
     "unit of the suite": (own_values, r"its values are .*, those of the suite \[\['lumen', 'lm'\]\]"),
-    "errors in another unit": (other_unit, "its errors are smaller than those of any one answer"),
+    "errors in another unit": (other_unit, "its errors are not those of one answer"),
     "control of the data": (own_control, "lacks width, none, linear, None"),
     "note": (put("blocks", 0, "notes", value=[5]), "a leak mark, a note, a group or what groups are is no text"),
     "clipped of what": (put(*VALUES, "clipped", value=[9]), r"it says that \[9\] features were clipped"),

@@ -114,7 +114,7 @@ def test_a_group_is_a_demonstration(tmp_path: Path) -> None:
     options: dict[str, Any] = {"values": ("force:N", "obs/state[1]:mm", "origin[1]:m"), "labels": ("object",)}
     with pytest.raises(ValueError, match=r"column 'origin\[1\]' has fewer than two different values"):
         FolderConfig(path=demos(tmp_path), **options, **DEMOS).source()
-    with pytest.raises(ValueError, match=r"every is not for HDF5 and zarr, whose rows are all used"):
+    with pytest.raises(ValueError, match=r"every is not for tables, HDF5 and zarr, whose rows are all used"):
         FolderConfig(path=tmp_path / "demos.hdf5", every=5, **DEMOS).source()
     options["values"] = ("force:N", "obs/state[1]:mm", "origin[0]:m")
     pack = packed(FolderConfig(path=tmp_path / "demos.hdf5", **options, **DEMOS), tmp_path / "pack")

@@ -125,7 +125,7 @@ def problems_of(encoder: dict[str, Any], controls: Sequence[str]) -> Iterator[st
         yield f"has {len(set(weights))} weights for seeds {seeds}"
     if network := encoder.get("external"):
         told = [[network.get("seed")], [network.get("weights")], network.get("encoders", {}).keys()]
-        if told != [seeds, weights, encoder["parameters"].keys()]:
+        if told != [seeds[:1], weights[:1], encoder["parameters"].keys()]:  # that of the first seed
             yield "its network is of other seeds, weights or senses"
     elif encoder.get("features", {}).keys() != encoder["parameters"].keys():
         yield "its features and parameters are of other senses"
@@ -221,22 +221,22 @@ def _impossible(record: dict[str, Any], num_groups: int, folds: int) -> str:
     if [*map(type, clipped)] != [int, int] or not 0 <= clipped[0] <= clipped[1] < 1e9:
         return f"it says that {clipped} features were clipped"
     try:
-        sums = {name: np.array(record["sums"][name], float) for name in names}
+        sums = {name: np.atleast_2d(np.array(record["sums"][name], float)) for name in names}
         kinds = {np.array(values).dtype.kind for values in record["sums"].values()}
         truths = any(isinstance(x, bool) for part in record["sums"].values() for x in np.array(part, object).flat)
     except (TypeError, ValueError):
         return "its sums are no numbers"
     if truths or kinds - {"i", *"f" * ("targets" in record)}:
         return "its sums are no numbers"
-    n = sums["n"] = np.atleast_2d(sums["n"])
-    if any(np.atleast_2d(each).shape != n.shape for each in sums.values()) or n.shape[1] > num_groups:
+    n = sums["n"]
+    if any(each.shape != n.shape for each in sums.values()) or n.shape[1] > num_groups:
         return f"its sums are not of {num_groups} groups"
     texts = [text for target in record.get("targets", ()) for text in target]
     if len(texts) != 2 * len(record.get("targets", ())) or not all(isinstance(text, str) for text in texts):
         return f"its targets are {record['targets']}, not names and units"
     if "targets" in record and len(record["targets"]) != len(n):
         return f"it has sums of {len(n)} targets, and names of {len(record['targets'])}"
-    whole = n if "targets" in record else np.stack([n, np.atleast_2d(sums["correct"])])
+    whole = n if "targets" in record else np.stack([n, sums["correct"]])
     finite = all(np.isfinite(each).all() for each in sums.values())
     if not finite or (whole != whole.round()).any() or (whole < 0).any():
         return "a sum is not finite, or a number of rows is no natural number"
@@ -246,9 +246,6 @@ def _impossible(record: dict[str, Any], num_groups: int, folds: int) -> str:
         if record["source"] == "majority" and (sums["correct"] >= n).all():
             return "one answer is right for all rows"
         return "it has more correct rows than rows" if (sums["correct"] > n).any() else ""
-    if record["source"] == "mean" and not folds:  # one answer for all rows: their sums are as those of one group
-        sums = {name: np.c_[each, each.sum(1)] for name, each in sums.items()}
-        n = sums["n"]
     least = 1 - 1e-6  # sums have ten digits
     error, squared = sums["error"], sums["squared_error"]
     low, high = error**2 / np.maximum(n, 1), error**2
@@ -256,13 +253,24 @@ def _impossible(record: dict[str, Any], num_groups: int, folds: int) -> str:
         return "its squared errors are smaller or larger than its errors allow"
     square, of = sums["squared_value"] * n, sums["value"] ** 2
     wrong = (square < least * of).any() or (least * square > of)[n == 1].any()
-    if record["source"] == "mean" and (n * squared < square - of - 1e-6 * square).any():  # one answer per group
-        return "its errors are smaller than those of any one answer"
-    if record["source"] == "mean" and not folds:  # its answer is a root of the sum of all groups, the last
-        value, middle = sums["value"], sums["value"][:, -1:] / n[:, -1:]
-        away = np.sqrt(np.maximum((squared - sums["squared_value"])[:, -1:] / n[:, -1:] + middle**2, 0))
-        made = np.array([sums["squared_value"] - 2 * c * value + n * c**2 for c in (middle - away, middle + away)])
-        near = abs(made - squared) <= 1e-4 * (sums["squared_value"] + n * (middle**2 + away**2))
-        if not near.all(2).any(0).all():
-            return "its errors are not those of one answer"
+    if record["source"] == "mean":
+        answers = [_num_answers(*each) for each in zip(n, sums["value"], sums["squared_value"], squared, strict=True)]
+        away = n * squared - square + of  # (n times the distance of the answer from the group's mean) squared
+        if max(answers) > max(folds, 1) or ((away < -1e-6 * square) | (error**2 < away - 1e-6 * square)).any():
+            return "its errors are not those of one answer" + " per fold" * bool(folds)
     return "its squares are not those of its values" if wrong else ""
+
+
+def _num_answers(n: Any, value: Any, square: Any, squared: Any) -> int:
+    """How many answers, each for groups next to each other, are needed to make squared errors; arrays have a group each."""
+    n, value, square, squared = (each[n > 0] for each in (n, value, square, squared))
+    first, found = 0, 1
+    for last in range(1, len(n) + 1):
+        own = slice(first, last)
+        middle = value[own].sum() / n[own].sum()  # an answer is a root of the sum of its groups
+        away = np.sqrt(max((squared - square)[own].sum() / n[own].sum() + middle**2, 0))
+        made = np.array([square - 2 * c * value + n * c**2 for c in (middle - away, middle + away)])[:, own]
+        near = abs(made - squared[own]) <= 1e-4 * (square + n * (middle**2 + away**2))[own]
+        if not near.all(1).any():
+            first, found = last - 1, found + 1
+    return found

@@ -35,7 +35,8 @@ class _BuildOptions:
 def pack(argv: list[str]) -> None:
     chosen, rest = selectors(argv, ("--data",))
     if "--data" not in chosen:
-        usage = f"mvitac data pack --data {'|'.join(DatasetConfig.choices)} --out DIR"
+        packed = (name for name, kind in DatasetConfig.choices.items() if kind.source is not DatasetConfig.source)
+        usage = f"mvitac data pack --data {'|'.join(packed)} --out DIR"
         if asks_help(rest):
             print(f"usage: {usage}\n\nThe options of one: mvitac data pack --data NAME --help")
             return

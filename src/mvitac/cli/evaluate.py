@@ -42,8 +42,9 @@ def probe(argv: list[str]) -> None:
     options = parse(_ProbeOptions, argv, "probe")
     check_json(options.json)
     check_models(*options.runs)
-    if options.weights != "last" and not options.runs:
-        raise ValueError(f"--weights {options.weights} is of runs: name one, or leave it out")
+    if not options.runs and (options.weights != "last" or options.allow_leak):
+        idle = "--allow-leak" if options.allow_leak else f"--weights {options.weights}"
+        raise ValueError(f"{idle} is of runs: name one, or leave it out")
     loading()
     from mvitac.evaluation.encoders import about_lines
     from mvitac.evaluation.evaluate import probe_runs

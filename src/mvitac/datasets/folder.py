@@ -52,13 +52,15 @@ class FolderConfig(RecordedConfig):
             raise ValueError(f"{self.path} holds {' and '.join(f.name for f in tables)}: give the path of one of them")
         parquet = tables if tables or alone else sorted(self.path.rglob("*.parquet"))
         parquet = [file for file in parquet if file.suffix.lower() == ".parquet"]
-        if parquet and (images := read_parquet(self.path, parquet, self.vectors())):
-            return images
+        shown = read_parquet(self.path, parquet, self.vectors()) if parquet else None
+        arrays = [file for file in files if file.name.lower().endswith(ARRAYS)]
+        if (self.every or 1) > 1 and (listed := parquet * bool(shown) or tables or arrays):
+            raise ValueError(f"{listed[0]}: --data.every is not for tables, HDF5 and zarr, whose rows are all used")
+        if shown:
+            return shown
         if tables:
             return read_manifest(tables[0])
-        if arrays := [file for file in files if file.name.lower().endswith(ARRAYS)]:
-            if (self.every or 1) > 1:
-                raise ValueError(f"{arrays[0]}: --data.every is not for HDF5 and zarr, whose rows are all used")
+        if arrays:
             images = [name for name in (self.vision, *self.touch, *self.background) if name]
             return read_arrays(self.path, arrays, images, self.vectors())
         cameras = [name for name in (*self.touch, self.vision) if name]

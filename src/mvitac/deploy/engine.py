@@ -103,6 +103,8 @@ class Engine:
             raise ValueError(f"{self.folder} cannot be run ({brief(error)}): export it again") from None
         for task, names in self.classes.items():
             assert found[f"probability_{task}"].shape[1] == len(names), f"classes of {task}"
+        for task, targets in self.values.items():
+            assert found[f"value_{task}"].shape[1] == len(targets), f"values of {task}"
         here, allowed = f"{self.folder}: on this machine", self.meta["tolerance"]["min_cosine"]
         for name in (name for name in self.meta["outputs"] if name.startswith("embedding_")):
             least = float(cosines(found[name], check[name]).min())

@@ -59,7 +59,8 @@ class Embeddings:
         with fields_of(file):
             self.shared, self.pack, self.pack_digest = about["shared"], Path(about["pack"]), about["pack_digest"]
             self.classes = from_json(dict[str, tuple[str, ...]], about["classes"], f"{file}: classes")
-            self.table.select(["id", "group", "row"])  # KeyError if one is missing
+            needed = "id", "group", "row", *(f"label_{task}" for task in self.classes)
+            self.table.select(needed)  # KeyError if one is missing
             columns = {m: self.table.column(m) for m in ("vision", "touch") if m in self.table.column_names}
             whole = all(column.type.list_size and not column.null_count for column in columns.values())
             parts = {m: column.combine_chunks().flatten() for m, column in columns.items()}

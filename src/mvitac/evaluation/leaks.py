@@ -24,7 +24,7 @@ from mvitac.data.spec import MODALITIES
 from mvitac.nn.encoders import IMAGENET, SCRATCH
 from mvitac.nn.weights import said_trained_on
 from mvitac.run import Run, load_run
-from mvitac.system.files import SEAL, brief, digest, write_atomic
+from mvitac.system.files import SEAL, brief, check_ordinary, digest, write_atomic
 
 FILE, LEARNED = "trained_on.safetensors", "trained_on"  # and the name of its digest in run.json
 KEYS = ("ids", "groups", "images")
@@ -95,6 +95,7 @@ def read_sources(folder: Path, weights: str = "last") -> list[Source] | None:
     """What the ``weights`` of the run in ``folder``, last or best, learned from; None if that is not known."""
     if not (folder / FILE).exists():
         return None
+    check_ordinary(folder / FILE)  # a pipe never ends
     try:
         with safetensors.safe_open(folder / FILE, framework="numpy") as file:
             names = file.metadata()

@@ -77,6 +77,8 @@ class Plan:
             raise ValueError(f"row {taken[0]!r} has the name of a control: give it another label")
         if len({slug(label) for label in labels}) < len(labels):
             raise ValueError(f"plan {self.name!r}: two labels are one, but for case and punctuation: rename one")
+        if not labels:
+            raise ValueError(f"plan {self.name!r}: rows is empty, give one or more")
         check_known("reference row", [self.reference], labels)
 
     def only(self, labels: Sequence[str]) -> "Plan":

@@ -89,6 +89,8 @@ def load_checked(file: Path) -> Any:
     """What a file of torch holds, whose checksums are right: torch.load does not compare them. No code of it is run."""
     if zipfile.is_zipfile(file):
         with zipfile.ZipFile(file) as archive:
+            if any(entry.compress_type for entry in archive.infolist()):  # torch stores: a small file could fill memory
+                raise ValueError("it is compressed")
             if name := archive.testzip():
                 raise ValueError(f"{name} does not match its checksum")
     return torch.load(file, map_location="cpu", weights_only=True)

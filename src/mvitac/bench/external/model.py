@@ -224,6 +224,8 @@ def open_model(text: str) -> ExternalModel:
     """Open the encoder that ``text`` names; ValueError if that is not possible."""
     adapter = parse(text)
     loaded = adapter.load()
+    if adapter.trained_on and loaded.trained_on == NOTHING:
+        raise ValueError(f"{text}: random weights are trained on nothing: leave trained-on out")
     given = {name: getattr(adapter, name) for name in ("licence", "trained_on") if getattr(loaded, name) == UNKNOWN}
     given["title"] = adapter.title
     loaded = replace(loaded, **{name: value for name, value in given.items() if value})

@@ -10,7 +10,7 @@ named by their path below it. Attributes of the group, and of the groups above i
 has all episodes in one group, and their ends (exclusive) in meta/episode_ends.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from itertools import accumulate
 from math import prod
 from operator import getitem
@@ -54,7 +54,10 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
             raise ValueError(f"{link} is a link: copy what it shows into {file}")
         with open_arrays(file) as opened:
             everything = _datasets(opened)
-            for name in _demonstrations(file, everything, images):
+            demos = _demonstrations(file, everything, images)
+            lacking = (f"{file.name}: {name} is left out: it has no images" for name in _others(everything, demos))
+            notes |= dict.fromkeys(lacking)
+            for name in demos:
                 demo = "/".join(filter(None, (file.stem if len(files) > 1 or not name else "", name)))
                 datasets = _datasets(opened[name] if name else opened)
                 refs = _images(file, name, datasets, images, MAX_ROWS - len(rows))
@@ -130,6 +133,14 @@ def _demonstrations(file: Path, datasets: dict[str, Any], images: Collection[str
     if not groups:
         raise _no_images(file, images or USUAL[:2], _seen(datasets))
     return groups
+
+
+def _others(datasets: Iterable[str], demos: Collection[str]) -> list[str]:
+    """Return the groups beside the demonstrations that hold datasets, but no demonstration."""
+    homes = {(f"{name.rpartition('/')[0]}/".lstrip("/"), name.count("/") + 1) for name in demos if name}
+    inside = ((path, depth) for path in datasets for home, depth in homes if path.startswith(home))
+    beside = {"/".join(path.split("/")[:depth]) + "/" for path, depth in inside if path.count("/") >= depth}
+    return sorted(group[:-1] for group in beside if not any(f"{name}/".startswith(group) for name in demos))
 
 
 def _episodes(demo: str, ends: Any, num: int) -> list[tuple[str, int]]:
