@@ -296,8 +296,8 @@ def worse_mean(factor: float, folds: int, value: dict[str, Any]) -> None:
     value["suite"]["sets"][0]["folds"] = folds
     value["suite_digest"] = suite_of(value).digest()
     sums = next(r["sums"] for r in value["blocks"][1]["records"] if r["source"] == "mean")
-    for name, factor in (("error", factor), ("squared_error", factor**2)):
-        sums[name] = [[factor * x for x in each] for each in sums[name]]
+    for name, times in (("error", factor), ("squared_error", factor**2)):
+        sums[name] = [[times * x for x in each] for each in sums[name]]
 
 
 def copied(to: str, of: str, value: dict[str, Any], names: Sequence[str] = ("sums", "clipped")) -> None:

@@ -177,6 +177,8 @@ def test_python_functions(pack: Pack, functions: str) -> None:
     torch.testing.assert_close(net.features("touch", images), expected)
     tokens = open_model(f"{functions}tokens,size=32").on(pack)[0].features("touch", images)
     torch.testing.assert_close(tokens, (images.float() / 255).mean(1).flatten(1))
+    with pytest.raises(ValueError, match="random weights are trained on nothing: leave trained-on out"):
+        open_model("external:timm/test_resnet,weights=random,trained-on=ours")
     with pytest.raises(ValueError, match="NaN or infinite features of touch"):
         open_model(f"{functions}nan").on(pack)[0].features("touch", images)
     with pytest.raises(ValueError, match="batch: features of touch depend on the other images, or on chance"):

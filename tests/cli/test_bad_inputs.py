@@ -127,6 +127,8 @@ WORDS: list[tuple[str, str, str]] = [
     (PRETRAIN, "--batch-size " + "9" * 5000, "--batch-size"),
     (PRETRAIN, "--batch-size 100", "72 rows"),
     (PRETRAIN, "--optim.lr inf", "lr inf: give 1e-30 or more, a finite number"),
+    (PACKED, "--every 3", "presses.csv: --every is not for tables"),
+    ("probe --encoder external:timm/test_resnet,weights=random ", "--allow-leak", "--allow-leak is of runs: name one"),
     ("finetune {run} --data pack --out {out} ", "--seeds 0", "seeds 0: give 1 to 1000"),
     ("finetune {run} --data pack --out {out} ", "--lr --steps 3", "lr is empty: give at least one"),
     (PRETRAIN, "--augment.size 64", "--augment.size 32"),

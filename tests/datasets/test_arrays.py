@@ -172,12 +172,13 @@ def test_groups_inside_each_other(tmp_path: Path) -> None:
 
 def test_columns_of_episodes_are_ours(tmp_path: Path) -> None:
     """A dataset that is called demo must not split demonstrations over train and test."""
-    path = demos(tmp_path, **{"data/demo_1/demo": np.arange(5)})
+    path = demos(tmp_path, **{"data/demo_1/demo": np.arange(5), "data/lost/force": np.arange(5)})
     with h5py.File(path, "a") as file:
         file.attrs["note"] = np.bytes_(b"caf\xe9")  # no UTF-8, and of no use
     table = read_arrays(path, [path], ("obs/camera",), ())
     assert {row["demo"] for row in table.rows} == {f"data/demo_{k}" for k in range(4)}
-    assert table.notes == ("demo of demos.hdf5 is left out, ours has this name",)
+    lost = "demos.hdf5: data/lost is left out: it has no images"
+    assert table.notes == (lost, "demo of demos.hdf5 is left out, ours has this name")
 
 
 def test_what_a_demonstration_lacks(tmp_path: Path) -> None:

@@ -340,6 +340,9 @@ def test_an_export_gives_values_with_unit_and_spread(value_onnx: Path, value_art
     assert light["export"] == pytest.approx(model.probes["light.both"].info.errors[0].mae, rel=1e-3)
     spread = float(np.std(measured.values(measured.spec.values[0])[measured.rows("test")]))
     assert light["allowed"] == pytest.approx(0.1 * spread)
+    engine.values["light"] = []  # as in a file that somebody edited
+    with pytest.raises(AssertionError, match="values of light"):
+        engine._check()
 
 
 def test_an_export_that_changes_a_value_is_refused(value_artifact: Path, measured: Pack, pack: Pack) -> None:

@@ -104,6 +104,9 @@ def test_vectors_that_another_program_changed_are_refused(known: Path, tmp_path:
     for vectors in ([[math.nan] * len(whole[0])] * 9, [vector[1:] for vector in whole]):
         with pytest.raises(ValueError, match=r"other\.parquet has no vision vectors of \d+ numbers"):
             opened(vectors).find(model, query, "touch", "vision", 3)
+    pq.write_table(table.drop_columns(["label_pattern"]), file)
+    with pytest.raises(ValueError, match=r"other\.parquet is damaged: .*label_pattern"):
+        Embeddings(file, model.weights_digest())
     pq.write_table(table.replace_schema_metadata({"mvitac-embeddings": ""}), file)
     with pytest.raises(ValueError, match=r"other\.parquet is no table of mvitac embed"):
         Embeddings(file, model.weights_digest())

@@ -1,6 +1,7 @@
 """What a run learned from, or its owner says so, is compared with what is scored: refused, or LEAK beside every score."""
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -171,6 +172,10 @@ def test_a_list_is_that_of_its_run_and_of_its_weights(pack: Pack, tmp_path: Path
     assert CHOSE in Scored(pack).leak(read_sources(heir), val)
     write_sources(tmp_path, [source_of(pack, pack.rows("test"))])  # of a run that saw other rows
     with pytest.raises(ValueError, match="is of another run"):
+        read_sources(tmp_path)
+    (file := tmp_path / "trained_on.safetensors").unlink()
+    os.mkfifo(file)  # reading it would wait for ever
+    with pytest.raises(ValueError, match="neither a file nor a folder"):
         read_sources(tmp_path)
 
 

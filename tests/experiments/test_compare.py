@@ -183,6 +183,7 @@ def test_methods_of_these_plans_see_equally_many_images(pack: Pack, name: str) -
     [
         ("rows = [", "not valid TOML"),
         ("[[rows]]", "plan.rows: give label, too"),
+        ("rows = []", "plan 'p': rows is empty, give one or more"),
         ('[[rows]]\nlabel = "a"', "unknown reference row 'MViTac'"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\ntau = 1', "unknown field in plan.rows 'tau'"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\n[[rows]]\nlabel = "A"', "two labels are one"),

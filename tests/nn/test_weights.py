@@ -1,9 +1,11 @@
 """Weights are what was asked for, whole, or an error: never a silent fallback, or a random network under their name."""
 
+import io
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import pytest
 import safetensors.torch
@@ -188,5 +190,9 @@ def test_a_file_of_objects_is_not_run(tmp_path: Path) -> None:
     assert list(read_tensors(tmp_path / "w.pth")) == ["a.b"]
     whole, number = (tmp_path / "w.pth").read_bytes(), bytes(Tensor([1.0]).numpy())
     (tmp_path / "w.pth").write_bytes(whole.replace(number, bytes(Tensor([1.5]).numpy())))
-    with pytest.raises(ValueError, match="pth is damaged"):
-        read_tensors(tmp_path / "w.pth")
+    with ZipFile(io.BytesIO(whole)) as of, ZipFile(tmp_path / "bomb.pth", "w", ZIP_DEFLATED) as archive:
+        for name in of.namelist():  # torch.load would read it, of any length
+            archive.writestr(name, of.read(name))
+    for name in ("w.pth", "bomb.pth"):
+        with pytest.raises(ValueError, match="pth is damaged"):
+            read_tensors(tmp_path / name)
