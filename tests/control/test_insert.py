@@ -124,6 +124,7 @@ def test_a_result_that_no_episodes_give_is_refused(small: Insert) -> None:
         bad = good.copy()
         bad[place] = value
         assert small.impossible("both", one, bad)
+    assert small.impossible("both", one, 0 * good)
     cell = {"success": [1.0] * 3, "n": [1.0] * 3, "mm": [0.1] * 3, "deg": [0.1] * 3, "seed": None}
     assert "100 [100" not in small.text([cell])  # 3 of 3 say little
 

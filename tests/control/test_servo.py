@@ -168,9 +168,11 @@ def _not_lost(value: dict[str, Any]) -> None:
     cell["mm"][0], cell["deg"][0] = n * limit[0], n * float(np.hypot.reduce(limit[1:]))
 
 
+_PERFECT = {"mm": [0.0] * 2, "deg": [0.0] * 2, "lost": [0.0] * 2}
 CHANGES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "no episodes give": put("rows", 0, "cells", 0, "mm", 0, value=-1.0),
     "no touch, .* no episodes give": _not_lost,
+    "the encoder, .* no episodes give": lambda value: value["rows"][0]["cells"][0].update(_PERFECT),
     "no digests of what": put("data", "edge", value=None),
     "other sums here": _true,
     "the suite asks for": lambda value: value["rows"].pop(3),

@@ -110,6 +110,20 @@ def test_shrinking_is_that_of_pillow(made: dict[str, Path]) -> None:
     assert np.abs(shrunk - nearest).mean() > 5  # dropping pixels would show
 
 
+def test_frames_are_upright(made: dict[str, Path], tmp_path: Path) -> None:
+    """The header says that players turn a quarter clockwise, as a telephone's do."""
+    path, one = write_video(tmp_path / "a.mp4", 1, lambda i: numbered(i, "touch")), (1 << 16).to_bytes(4, "big")
+    ((_, plain),) = frames(path, [0])
+    matrix, turned = (
+        one + bytes(12) + one,
+        bytes(4) + one + bytes(4) + (-1 << 16).to_bytes(4, "big", signed=True) + bytes(4),
+    )
+    whole = path.read_bytes()
+    at = whole.index(matrix, whole.index(b"tkhd"))
+    ((_, upright),) = frames(copy_with(path, tmp_path / "b.mp4", at, turned), [0])
+    assert (upright == np.rot90(plain, -1)).all()
+
+
 @pytest.fixture
 def count(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
     """How often the decoder is started and how many packets it gets."""

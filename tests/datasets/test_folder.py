@@ -510,6 +510,13 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
             picture(tmp_path / folder / name)
         with pytest.raises(ValueError, match=says):
             FolderConfig(path=tmp_path / folder).source()
+    (tmp_path / "half flat/touch/1.png").unlink()
+    (tmp_path / "half flat/touch/a/1.png").symlink_to("not fetched")
+    with pytest.raises(ValueError, match=r"1 of 2 image files are missing or empty, e.g. row 1 touch touch/a/1\.png"):
+        FolderConfig(path=tmp_path / "half flat").source()
+    (tmp_path / "half flat/touch/b").symlink_to(tmp_path / "lonely")
+    with pytest.raises(ValueError, match="touch/b is a link to a folder: put the folder in its place"):
+        FolderConfig(path=tmp_path / "half flat").source()
 
 
 def test_commands_say_what_a_group_is(tmp_path: Path, rows: Table, capsys: pytest.CaptureFixture[str]) -> None:

@@ -112,6 +112,10 @@ def test_a_log_ends_before_what_is_none(tmp_path: Path) -> None:
     for bad in ("[]", '{"step": 4, "loss": {}}', '{"step": 4, "eval": null}', '{"step": 4, "eval": {"a": []}}'):
         (tmp_path / "log.jsonl").write_text("\n".join([*good, bad]))
         assert [entry["step"] for entry in read_log(tmp_path)] == [0, 2], bad
+    (tmp_path / "log.jsonl").unlink()
+    os.mkfifo(tmp_path / "log.jsonl")  # reading it would wait for ever
+    with pytest.raises(ValueError, match="neither a file nor a folder"):
+        read_log(tmp_path)
 
 
 def test_killed_between_two_checkpoints(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:

@@ -121,6 +121,8 @@ def find(argv: list[str]) -> None:
         pack = Pack(known.pack, verify=False)
         if pack.digest != known.pack_digest:
             raise ValueError(f"{pack.path} is another pack than the one that was embedded: embed it again")
+        if any(one["row"] not in range(pack.num) or pack.own_ids[one["row"]] != one["id"] for one in found):
+            raise ValueError(f"{options.known}: its ids are not those of its rows in {pack.path}: embed it again")
         tiles = [(pack.images[target][one["row"]], f"{one['cosine']:.3f} {one['id']}") for one in found]
         blocks = [("query", [(query, "")]), ("found", tiles)]
         sheet = draw(title, [(name, [(side_by_side(fit(x, _SIDE)), t) for x, t in some]) for name, some in blocks])

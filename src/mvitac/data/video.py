@@ -109,7 +109,8 @@ def frames(
                     # Bilinear as Pillow's resize (every source pixel counts), but directly from the decoder's planes.
                     shape = {"width": size or frame.width, "height": size or frame.height}
                     rgb = reformatter.reformat(frame, format="rgb24", interpolation=Interpolation.BILINEAR, **shape)
-                    yield left.popleft(), rgb.to_ndarray()
+                    turned = np.rot90(rgb.to_ndarray(), round(frame.rotation / 90))  # upright, as it is played
+                    yield left.popleft(), np.ascontiguousarray(turned)
                 ahead = packets.start_of(left[0]) if left else key
                 if not left or (ahead > key and packets.keys[ahead] > run.fed + 1):
                     break  # nothing more is wanted, or a later key packet is nearer than the next packet

@@ -18,7 +18,7 @@ from mvitac.data.pack import Pack
 from mvitac.evaluation.features import features, fitting
 from mvitac.model import Model
 from mvitac.registry import check_known, from_json
-from mvitac.system.files import brief, fields_of, write_atomic
+from mvitac.system.files import CONTROL, brief, fields_of, write_atomic
 from mvitac.transforms.preprocess import ImageInput
 
 ABOUT = b"mvitac-embeddings"  # entry of the file's metadata: JSON
@@ -59,8 +59,6 @@ class Embeddings:
         with fields_of(file):
             self.shared, self.pack, self.pack_digest = about["shared"], Path(about["pack"]), about["pack_digest"]
             self.classes = from_json(dict[str, tuple[str, ...]], about["classes"], f"{file}: classes")
-            needed = "id", "group", "row", *(f"label_{task}" for task in self.classes)
-            self.table.select(needed)  # KeyError if one is missing
             columns = {m: self.table.column(m) for m in ("vision", "touch") if m in self.table.column_names}
             whole = all(column.type.list_size and not column.null_count for column in columns.values())
             parts = {m: column.combine_chunks().flatten() for m, column in columns.items()}
@@ -68,6 +66,14 @@ class Embeddings:
             assert whole and self.table.num_rows, "not one whole vector in every row"
             given = {m: part.to_numpy() for m, part in parts.items()}
             assert not any(np.isinf(x).any() for x in given.values()), "infinite numbers"
+            for task, names in self.classes.items():
+                labels = self.table.column(f"label_{task}").to_pylist()
+                assert {*map(type, labels)} == {int} and -1 <= min(labels) <= max(labels) < len(names), (
+                    f"labels of {task}"
+                )
+            own = self.table.select(["id", "group", "row"]).to_pydict()
+            assert {*map(type, own["row"])} == {int}, "numbers of rows"
+            assert not CONTROL.search(json.dumps([own["id"], own["group"]])), "a control character"
             self.banks = {m: unit(x.reshape(self.table.num_rows, -1)) for m, x in given.items()}
             if about["weights"] != weights:
                 raise ValueError(f"{file} was embedded by another model: embed the pack again")

@@ -14,7 +14,7 @@ from typing import Any
 from mvitac.data.pack import Pack
 from mvitac.registry import check_known, to_json
 from mvitac.run import Run
-from mvitac.system.files import naming, parse_json, write_atomic
+from mvitac.system.files import check_ordinary, naming, parse_json, write_atomic
 from mvitac.system.progress import say, shown, work
 
 Logger = Callable[[int, dict[str, float]], None]  # called with a step and the values logged at it
@@ -151,6 +151,7 @@ def _line(first: list[str], cells: list[str], last: str, widths: dict[str, int])
 def read_log(run: Path) -> list[dict[str, Any]]:
     """Entries of the log.jsonl in a run's folder. An incomplete line, written when the run was killed, ends them."""
     path, entries = run / "log.jsonl", []
+    check_ordinary(path)  # a pipe never ends
     for line in path.read_text(errors="replace").splitlines() if path.exists() else ():
         try:
             entry = parse_json(line)
