@@ -141,8 +141,7 @@ def value_artifact(measured: Pack, tmp_path_factory: pytest.TempPathFactory) -> 
     from support.training_runs import smoke
 
     def make(folder: Path) -> None:
-        run = smoke(measured, steps=2, eval_every=0)
-        publish(train(run, folder / "run", quiet=True), folder / "artifact")
+        publish(train(smoke(measured, steps=2, eval_every=0), folder / "run", quiet=True), folder / "artifact")
 
     return made_once(tmp_path_factory, "values", make) / "artifact"
 

@@ -25,7 +25,6 @@ from support.training_runs import smoke
 
 
 def batch(pack: Pack, num: int, modality: str = "touch") -> torch.Tensor:
-    """The first ``num`` images, uint8 [num, C, H, W]."""
     return torch.from_numpy(np.array(pack.images[modality][:num])).permute(0, 3, 1, 2)
 
 
@@ -189,9 +188,8 @@ def test_trunk_of_two_sensors_has_six_channels(tmp_path: Path) -> None:
     model = fresh(smoke(pack), pack.spec, 32)
     cfg = model.trunk("touch").pretrained_cfg
     assert cfg["input_size"] == (6, 32, 32) and cfg["mean"] == IMAGENET[0] * 2 and len(cfg["std"]) == 6
-    streams = replace(model.run, method=CalandraConfig())
     with pytest.raises(ValueError, match="no single timm model but a Streams"):
-        fresh(streams, pack.spec, 32).trunk("touch")
+        fresh(replace(model.run, method=CalandraConfig()), pack.spec, 32).trunk("touch")
 
 
 def test_models_can_be_copied_and_pickled(artifact: Path, pack: Pack) -> None:

@@ -24,7 +24,6 @@ PAGES = sorted(p for p in (DOCS / "tutorials").glob("*.md") if p.name != "index.
 
 
 def cells(file: Path) -> list[tuple[str, str]]:
-    """Kind and source of every cell of a page."""
     return [(cell.cell_type, cell.source) for cell in jupytext.read(file).cells]
 
 

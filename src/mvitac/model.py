@@ -180,8 +180,7 @@ class Model(nn.Module):
 
         ``task`` is one of ``tasks``; ``features``: modality -> ``features(..., for_heads=True)``.
         """
-        head = self.classifiers[self.tasks.index(task)]
-        found = head(torch.cat([features[m] for m in self.encoders], dim=1))
+        found = self.classifiers[self.tasks.index(task)](torch.cat([features[m] for m in self.encoders], dim=1))
         return found.softmax(dim=1) if task in {task.name for task in self.spec.tasks} else found
 
     def embed(

@@ -204,8 +204,7 @@ def test_what_is_not_there_is_said(results: list[Path], root: Path, capsys: pyte
     blocks = read_result(results[0])["blocks"]
     assert blocks[3]["not_run"].endswith("elsewhere is not there") and blocks[2]["form"] == "copy"
     empty = "bench", RANDOM.format(0), "--suite", root / "toys.toml", "--out", root / "nothing"
-    says = "was scored on no task of toys: no --data-root was given, where stripes would be"
-    assert says in said(capsys, *empty)
+    assert "was scored on no task of toys: no --data-root was given, where stripes would be" in said(capsys, *empty)
     assert not list((root / "nothing").glob("*.json"))
 
 
@@ -315,13 +314,11 @@ def other_unit(value: dict[str, Any]) -> None:
 
 
 def own_control(value: dict[str, Any]) -> None:
-    """The suite asks for a column of the data."""
     value["suite"]["sets"][0]["forms"][0]["data"] = {"name": "folder", "controls": ["width = w,h"]}
     value["suite_digest"] = suite_of(value).digest()
 
 
 def own_values(value: dict[str, Any]) -> None:
-    """The suite says which values the data has."""
     value["suite"]["sets"][0]["forms"][0]["data"] = {"name": "folder", "values": ["light=lumen:lm"]}
     value["suite_digest"] = suite_of(value).digest()
 
@@ -573,8 +570,7 @@ def test_encoders_that_cannot_be_scored_are_refused(
     with torch.no_grad():
         next(model.encoders["touch"].parameters()).fill_(float("nan"))
     model.save(broken / "model.safetensors")
-    error = said(capsys, "bench", broken, *bench)
-    assert "gives NaN or infinite features of touch for 120 of 120 images" in error
+    assert "gives NaN or infinite features of touch for 120 of 120 images" in said(capsys, "bench", broken, *bench)
     (tmp_path / "six").mkdir()
     fresh(run, replace(spec, touch_channels=6, vision_channels=0), 32).save(tmp_path / "six" / "model.safetensors")
     assert "takes 6 channels of touch, the data has 3" in said(capsys, "bench", tmp_path / "six", *bench)

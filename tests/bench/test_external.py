@@ -61,8 +61,7 @@ def test_the_same_network_gives_the_same_features_as_in_a_run(pack: Pack, tmp_pa
     run = recipe("smoke", PackConfig(path=pack.path))
     run = replace(run, encoder=run.encoder.changed(trunk="test_resnet", pool=pool))
     ours = fresh(replace(run, augment=replace(run.augment, size=32, whole=None)), pack.spec, pack.size)
-    trunk = ours.encoders["touch"]
-    torch.save(within(trunk).state_dict(), tmp_path / "trunk.pth")
+    torch.save(within(ours.encoders["touch"]).state_dict(), tmp_path / "trunk.pth")
     text = f"external:timm/test_resnet,weights={tmp_path / 'trunk.pth'},size=32,pool={pool}"
     theirs, same = open_model(text).on(pack)
     assert same is pack

@@ -73,8 +73,7 @@ def test_a_path_is_data(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     (tmp_path / "robot" / "meta" / "info.json").touch()
     monkeypatch.chdir(tmp_path)
     (tmp_path / "materials").mkdir()
-    found = {"pairs.csv": "folder", "robot": "lerobot", str(pack.path): "pack", ".": "folder"}
-    for path, name in found.items():
+    for path, name in {"pairs.csv": "folder", "robot": "lerobot", str(pack.path): "pack", ".": "folder"}.items():
         assert dataset(path) == replace(default(DatasetConfig, name), path=Path(path))
     assert dataset("materials") == default(DatasetConfig, "materials")
     for name in ("pairs.cvs", "packs/mine"):

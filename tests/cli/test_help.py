@@ -39,5 +39,4 @@ def test_help_imports_nothing_heavy() -> None:
 
 
 def test_no_help_is_left_behind() -> None:
-    """A command that is gone has no file."""
     assert {path.stem for path in help_file("").parent.glob("*.txt")} == {name.replace(" ", "-") for name in COMMANDS}

@@ -160,8 +160,7 @@ def test_an_episode_is_one_recording_of_a_group(pack: Pack) -> None:
     made = with_columns(pack, group=["one object"] * pack.num)
     for own, theirs in zip(read_episodes(made).rows, read_episodes(pack).rows, strict=True):
         assert np.array_equal(own, theirs)
-    says = r"two rows of touch .* are at \d+: pack with"
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=r"two rows of touch .* are at \d+: pack with"):
         read_episodes(with_columns(made, frame=np.arange(pack.num) // 2))
 
 

@@ -40,13 +40,11 @@ def small() -> Servo:
 
 @pytest.fixture(scope="module")
 def done(small: Servo, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("servo")
-    return result.run_suite([RANDOM.format(5)], small, out, About(name="five"))
+    return result.run_suite([RANDOM.format(5)], small, tmp_path_factory.mktemp("servo"), About(name="five"))
 
 
 @pytest.fixture(autouse=True)
 def known(monkeypatch: pytest.MonkeyPatch, small: Servo) -> None:
-    """The small suite is one of this version."""
     find = result.find_suite
     monkeypatch.setattr(result, "find_suite", lambda name: small if name == small.name else find(name))
     monkeypatch.setattr(result, "shipped", lambda: [small.name, "servo-v1"])
@@ -63,8 +61,7 @@ def test_a_correction_changes_the_pose_by_itself(kind: str) -> None:
 
 
 def test_poses_mean_what_their_names_say() -> None:
-    straight = begin("straight", 0).shape
-    assert np.allclose(Edge.pose(straight, np.array([7.0, 1.5, np.radians(-20)])), [1.5, 20])
+    assert np.allclose(Edge.pose(begin("straight", 0).shape, np.array([7.0, 1.5, np.radians(-20)])), [1.5, 20])
     wavy = begin("surface", 0).shape
     at = Surface.state(wavy, np.array([0.4, 3.0, -2.0]), 12.0)
     assert np.allclose(Surface.pose(wavy, at), [0.4, 3.0, -2.0])
@@ -75,13 +72,12 @@ def test_poses_mean_what_their_names_say() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_true_pose_stays_on_and_no_touch_does_not(kind: str) -> None:
-    task = task_of(kind)
     for known in (True, False):
         errors = []
         for number in range(8):
             episode = begin(kind, number)
             for _ in range(60):
-                episode.step(-0.5 * (episode.poses[-1] - task.target) * known)
+                episode.step(-0.5 * (episode.poses[-1] - task_of(kind).target) * known)
             errors.append(episode.error[0])
         assert (np.mean(errors) < 0.15) == known
 

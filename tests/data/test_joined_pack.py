@@ -105,8 +105,7 @@ def test_an_image_that_is_learned_from_and_scored_is_refused(pack: Pack, tmp_pat
         names = {"id": f"new {item}", "group": f"{item + 1}", "split": ELSEWHERE[sample.columns["split"]]}
         return {"vision": np.rot90(sample.vision), **names}  # type: ignore[arg-type]
 
-    source = altered(Toy(), change, name="renamed", group_by="row")
-    renamed = build(source, tmp_path / "renamed", size=32, quiet=True)
+    renamed = build(altered(Toy(), change, name="renamed", group_by="row"), tmp_path / "renamed", size=32, quiet=True)
     for learn, score, row in ((pack, renamed, "new 0"), (renamed, pack, "0036")):
         with pytest.raises(ValueError, match=rf"the touch image of row '{row}' is learned from in .* one of \d+: give"):
             JoinedPack(learn, score)
@@ -115,8 +114,7 @@ def test_an_image_that_is_learned_from_and_scored_is_refused(pack: Pack, tmp_pat
 def test_probe_learns_on_one_pack_and_meets_another(
     pack: Pack, negative: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = smoke(pack, steps=1, eval_every=0)
-    train(run, tmp_path / "run", quiet=True)
+    train(smoke(pack, steps=1, eval_every=0), tmp_path / "run", quiet=True)
     asked = ["probe", str(tmp_path / "run"), "--tasks", "pattern", "--modalities", "touch", "--json"]
     assert not main([*asked, str(tmp_path / "new.json"), "--on", str(negative.path), "--learn-on", str(pack.path)])
     result = json.loads((tmp_path / "new.json").read_text())

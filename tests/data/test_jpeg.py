@@ -199,7 +199,6 @@ def test_decoding_runs_ahead_of_the_step(small: Pack, decoded: Pack, monkeypatch
     for pack, name in ((small, "prefetch"), (decoded, "MainThread")):
         makers.clear()
         run, rows = run_on(pack), pack.rows("train")
-        views = StepViews(run, pack, 2, torch.device("cpu"))
-        for parts in views.iterate(Batches(run, pack, rows), 0, 3):
+        for parts in StepViews(run, pack, 2, torch.device("cpu")).iterate(Batches(run, pack, rows), 0, 3):
             assert len(parts[0]().rows) == run.batch_size
         assert len(makers) == 3 and all(maker.startswith(name) for maker in makers)

@@ -39,8 +39,7 @@ def test_rows_are_those_of_the_parts_together_and_alone(pack: Pack, gel: Pack) -
     assert mix.whole.all() and len(mix.rows("train", having=("vision",))) == len(pack.rows("train"))
     rows = np.array([pack.num + 3, 5, pack.num + 3, 0])
     small, large = gel.images["touch"][3], pack.images["touch"]
-    expected = [fit(small, 32), large[5], fit(small, 32), large[0]]
-    np.testing.assert_array_equal(mix.images["touch"][rows], expected)
+    np.testing.assert_array_equal(mix.images["touch"][rows], [fit(small, 32), large[5], fit(small, 32), large[0]])
     np.testing.assert_array_equal(mix.images["touch"][pack.num + 3], fit(small, 32))
     assert not mix.images["vision"][rows[0]].any() and mix.images["vision"][5].any()
     assert "gel: images of 24 px are resized to 32 px as they are read" in mix.spec.notes

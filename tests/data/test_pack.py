@@ -323,8 +323,7 @@ def test_scoring_on_val_hides_test(pack: Pack) -> None:
     np.testing.assert_array_equal(choosing.rows("test"), whole.rows("val"))
     np.testing.assert_array_equal(choosing.rows("train", "unlabelled"), whole.rows("train", "unlabelled"))
     assert not len(choosing.rows("val")) and choosing.spec.notes == (*whole.spec.notes, ON_VAL)
-    task = whole.spec.tasks[0].name
-    assert (choosing.labels(task, "train", "val", "test")[whole.rows("test")] == -1).all()
+    assert (choosing.labels(whole.spec.tasks[0].name, "train", "val", "test")[whole.rows("test")] == -1).all()
 
 
 def test_rows_of_one_task_alone_are_hidden_from_all_else(pack: Pack) -> None:

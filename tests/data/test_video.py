@@ -46,7 +46,6 @@ def path(request: pytest.FixtureRequest, made: dict[str, Path]) -> Path:
 
 
 def packets_of(path: Path) -> list[tuple[int, int]]:
-    """(position, bytes) of every packet in the file."""
     with av.open(str(path)) as container:
         return [(p.pos or 0, p.size) for p in container.demux(video=0) if p.size]
 

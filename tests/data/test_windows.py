@@ -63,8 +63,7 @@ def presses(tmp_path_factory: pytest.TempPathFactory) -> Pack:
 def shown(pack: Pack, touch: int, frame: int, modality: str = "touch") -> list[int]:
     """The frame numbers that the row of this frame shows."""
     (row,) = np.flatnonzero((pack.column("touch_group") == f"t{touch}") & (pack.column("frame") == frame))
-    levels = pack.images[modality][row][0, 0, ::3].astype(int)
-    return ((levels - 10 - 20 * touch) // 2).tolist()
+    return ((pack.images[modality][row][0, 0, ::3].astype(int) - 10 - 20 * touch) // 2).tolist()
 
 
 def test_a_window_shows_this_frame_and_earlier_ones_of_the_same_touch(presses: Pack) -> None:
@@ -92,8 +91,7 @@ def test_rows_at_the_start_can_be_left_out(presses: Pack) -> None:
 def test_the_first_frame_of_the_touch_can_be_subtracted(presses: Pack) -> None:
     pack = windowed(presses, Window(frames=2, minus_first=True))
     for row in range(presses.num):
-        frame = int(pack.column("frame")[row])
-        assert (pack.images["touch"][row][..., :3] == 128 + frame).all()
+        assert (pack.images["touch"][row][..., :3] == 128 + int(pack.column("frame")[row])).all()
 
 
 def test_other_windows_are_other_data_and_single_frames_are_the_pack_itself(presses: Pack) -> None:

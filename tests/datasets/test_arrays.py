@@ -157,14 +157,13 @@ def test_usual_names_need_no_option(tmp_path: Path) -> None:
 
 def test_groups_inside_each_other(tmp_path: Path) -> None:
     """Links are not followed, a second name is not a second recording, and 3,000 levels are read in seconds."""
-    other = write(tmp_path / "other.h5", {"touch": grays(1, 2)})
     with h5py.File(tmp_path / "deep.h5", "w") as file:
         group = file
         for _ in range(3000):
             group = group.create_group("g")
         group["touch"] = np.zeros((4, 8, 8, 3), np.uint8)
         group["up"], group["same"], file["second"] = file, h5py.SoftLink("nowhere"), group
-        file["a"] = h5py.ExternalLink(str(other), "/")
+        file["a"] = h5py.ExternalLink(str(write(tmp_path / "other.h5", {"touch": grays(1, 2)})), "/")
     start = time.monotonic()
     table = read_arrays(tmp_path / "deep.h5", [tmp_path / "deep.h5"], (), ())
     assert [row["demo"] for row in table.rows] == ["/".join(["g"] * 3000)] * 4 and time.monotonic() - start < 10
@@ -326,8 +325,7 @@ def test_numbers_of_more_than_8_bits(tmp_path: Path) -> None:
         packed(FolderConfig(path=tmp_path / "m.csv", size=16, group="take"), tmp_path / "no")
     config = FolderConfig(path=tmp_path / "m.csv", size=16, group="take", range=("touch=-1:1", "vision=0:1900"))
     pack = packed(config, tmp_path / "r")
-    level = np.arange(20) * 255 / 19
-    assert (abs(pack.images["vision"][:, 0, 0, 0] - level) <= 0.51).all()
+    assert (abs(pack.images["vision"][:, 0, 0, 0] - (np.arange(20) * 255 / 19)) <= 0.51).all()
     assert (abs(pack.images["touch"][:, 0, 0, :2] - np.arange(20)[:, None] * 12.75) <= 0.51).all()
     assert not pack.images["touch"][..., 2].any()
 

@@ -115,12 +115,10 @@ def test_object_names_are_repaired(tmp_path: Path) -> None:
 
 def test_outcome_as_pytables_stores_it(tmp_path: Path) -> None:
     """deepdish wrote through PyTables, whose bool attributes are 8-bit bit fields, not HDF5 enums."""
-    path = write_shard(tmp_path, 0, [b"lemon", b"lime"])
-    with h5py.File(path, "a") as file:
+    with h5py.File(write_shard(tmp_path, 0, [b"lemon", b"lime"]), "a") as file:
         attributes = file["data/i0"].attrs
         del attributes["is_gripping"]
-        space = h5py.h5s.create(h5py.h5s.SCALAR)
-        made = h5py.h5a.create(attributes._id, b"is_gripping", h5py.h5t.NATIVE_B8, space)
+        made = h5py.h5a.create(attributes._id, b"is_gripping", h5py.h5t.NATIVE_B8, h5py.h5s.create(h5py.h5s.SCALAR))
         made.write(np.array(1, np.uint8), mtype=h5py.h5t.NATIVE_B8)
     assert CalandraConfig(path=tmp_path, split="object").source().read(0)[0].columns["outcome"] == 1
 
@@ -247,8 +245,7 @@ def test_the_owners_order_is_python_2s_shuffle() -> None:
     """random.Random's own floats are those of Python 2; its shuffle(x, random) was j = int(random() * (i + 1))."""
     names = [f"o{i:02d}" for i in range(20)]
     expected, generator = list(names), random.Random(3)
-    floats = [generator.random() for _ in range(19)]
-    for i, value in zip(range(19, 0, -1), floats, strict=True):
+    for i, value in zip(range(19, 0, -1), [generator.random() for _ in range(19)], strict=True):
         j = int(value * (i + 1))
         expected[i], expected[j] = expected[j], expected[i]
     assert owners_shuffle(names[::-1], 3) == expected and sorted(expected) == names != expected
@@ -286,8 +283,7 @@ def test_after_reaches_no_probe_unless_named_and_then_every_table_says_so(leakin
         result = probe_runs([train(run, tmp_path / f"run-{ask[0]}", quiet=True)], session)
         print_summary(result, file := io.StringIO())
         tables = file.getvalue()
-        log = (tmp_path / f"run-{ask[0]}" / "log.jsonl").read_text()
-        shown[ask[0]] = result["summary"], tables, log
+        shown[ask[0]] = result["summary"], tables, (tmp_path / f"run-{ask[0]}" / "log.jsonl").read_text()
     honest, leaked = shown["during"], shown["after"]
     assert set(honest[0]) == {"success"} and "after" not in honest[1] and "after" not in honest[2]
     assert honest[0]["success"]["touch"]["pixels"]["mean"] < 0.75

@@ -188,8 +188,7 @@ def test_slip_grasp_pairs_by_frame(packs: dict[str, Pack]) -> None:
         assert abs(level(pack.images["touch"][i]) - expected - 100) < 3
     grasps = {f"{k + 1:03d}_04{k}_{2 * g}0" for k in range(4) for g in range(3 + k % 2)}
     assert set(pack.column("touch_group")) == grasps
-    first = pack.column("group") == "001"
-    assert np.isclose(np.unique(pack.column("width_in_sweep")[first]), [-0.2, 0.0, 0.2]).all()
+    assert np.isclose(np.unique(pack.column("width_in_sweep")[pack.column("group") == "001"]), [-0.2, 0.0, 0.2]).all()
     assert pack.spec.controls["width"] == ("width_mm",)
 
 

@@ -62,8 +62,7 @@ def write_tree(root: Path, *, jpegs: bool = False) -> Path:
                 write_video(folder / f"{stem}.mp4", NUM_FRAMES, lambda i, s=stream: numbered(i, s))
         for side, runs in TOUCHES.items():
             for touch, run in enumerate(runs):
-                label = (2 * place + touch) % 20
-                rows[side] += [f"{name}/{i:010d}.jpg,{label}" for i in run if place < 7]
+                rows[side] += [f"{name}/{i:010d}.jpg,{(2 * place + touch) % 20}" for i in run if place < 7]
         rough = "train" if place < 2 or place == 7 else "test" if place < 4 else ""
         for number in (*range(70, 74), *range(130, 134)) if rough else ():
             rows[f"{rough}_rough"].append(f"{name}/{number:010d}.jpg,{int(number < 100)}")
@@ -125,8 +124,7 @@ def test_frames_that_only_the_rough_lists_name_are_hidden_from_all_else() -> Non
     rough = next(task for task in pack.spec.tasks if task.name == "rough")
     rows = split_rows(pack, rough)
     assert (len(rows.fitted), len(rows.test)) == (35_119, 8_085)
-    method = SupervisedConfig(tasks=("rough",))
-    assert set(method.training_rows(pack)) == set(rows.fitted)
+    assert set(SupervisedConfig(tasks=("rough",)).training_rows(pack)) == set(rows.fitted)
     assert len(MViTacConfig().training_rows(pack)) == 91_982
     groups = pack.column("group")
     kept = ["id", "group", "split", "split_rough", "label_category", "label_soft", "label_rough"]

@@ -27,10 +27,9 @@ def test_predicts_what_the_probe_scored(smoke_run: Path, artifact: Path, pack: P
     summary = probe_runs([smoke_run], ProbeConfig(controls=False))["summary"]
     for task in pack.spec.tasks:
         rows = split_rows(pack, task).test
-        labels = pack.column(f"label_{task.name}")[rows]
         for modality, names in (("touch", ["touch"]), ("vision", ["vision"]), ("both", ["vision", "touch"])):
             found = model.predict(**{m: pack.images[m][rows] for m in names})[task.name]
-            accuracy = float((found.argmax(1).numpy() == labels).mean())
+            accuracy = float((found.argmax(1).numpy() == pack.column(f"label_{task.name}")[rows]).mean())
             assert accuracy == pytest.approx(summary[task.name][modality]["mvitac"]["mean"])
             assert accuracy == pytest.approx(model.probes[f"{task.name}.{modality}"].info.accuracy)
             torch.testing.assert_close(found.sum(1), torch.ones(len(rows)))

@@ -35,8 +35,7 @@ def test_commands_know_base(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.chdir(tmp_path)
     found = parse(_ProbeOptions, ["base", "--tasks", "feel", "base"], "probe")
     assert found.runs == (BASE,) and found.config.tasks == ("feel", "base")
-    run = replace(mvitac.recipe("locked"), init=mvitac.Init(path=Path("base")))
-    start = read_start(run.init)
+    start = read_start(replace(mvitac.recipe("locked"), init=mvitac.Init(path=Path("base"))).init)
     assert start is not None and set(start.model.encoders) == {"vision", "touch"}
 
 

@@ -46,8 +46,7 @@ def test_a_clip_is_read_as_the_packs_window(model: Model, measured: Pack) -> Non
     touch, windows = measured.images["touch"], windowed(measured, Window(frames=2)).images["touch"]
     clip = np.stack([touch[0], touch[3]])
     wanted = model.features("touch", torch.from_numpy(windows[3:4]).permute(0, 3, 1, 2))
-    other = model.embed(touch=clip[::-1].copy())["touch"]
-    assert not torch.allclose(other, wanted)
+    assert not torch.allclose(model.embed(touch=clip[::-1].copy())["touch"], wanted)
     pictures = [Image.fromarray(frame) for frame in clip]
     tensors = torch.from_numpy(clip).permute(0, 3, 1, 2)
     for given in (clip, list(clip), pictures, tensors, clip[None], [clip], [pictures], windows[3:4], windows[3]):
@@ -109,8 +108,7 @@ class Seeing:
 def play(engine: Seeing, times: list[float], config: LiveConfig = LiveConfig(calibration=2)) -> list[list[int]]:
     """Frames at ``times`` (after eight free ones); what the engine saw, as frame numbers from 9 on."""
     clock = Clock()
-    rig = Counter(clock, 0)
-    stream = Stream("touch", rig, clock=clock)
+    stream = Stream("touch", Counter(clock, 0), clock=clock)
     live = Live(engine, {"touch": [stream]}, config, clock=clock)  # type: ignore[arg-type]
     for time in [*(99 + k / 10 for k in range(8)), *times]:
         clock.now = time

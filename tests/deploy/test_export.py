@@ -81,8 +81,7 @@ def test_the_resize_in_the_graph_is_the_probes_pixel_by_pixel(stored: int, model
     images = torch.randint(0, 256, (3, 3, stored, stored), dtype=torch.uint8, generator=generator)
     was, model.stored = model.stored, stored
     try:
-        graph = ExportModule(model)
-        found = graph.views["touch"](images.permute(0, 2, 3, 1))
+        found = ExportModule(model).views["touch"](images.permute(0, 2, 3, 1))
     finally:
         model.stored = was
     torch.testing.assert_close(found, plain_view(images, 32), atol=1e-4, rtol=0)
@@ -318,8 +317,7 @@ def test_the_spread_of_a_prediction_is_that_of_test_rows_in_its_range(
 
 def test_the_card_has_errors_in_the_unit(value_artifact: Path) -> None:
     text = (value_artifact / "README.md").read_text()
-    model = mvitac.load(value_artifact)
-    errors = model.probes["both.touch"].info.errors
+    errors = mvitac.load(value_artifact).probes["both.touch"].info.errors
     assert "Accuracy or R2 in percent" in text and "- both: level in levels, weight in N" in text
     assert f"{errors[1].mae:.3g} ({errors[1].rmse:.3g}) N" in text
     assert "| mean |" in text and "| untrained |" in text

@@ -91,7 +91,6 @@ def forge(
 
 
 def data(name: str, **fields: Any) -> Change:
-    """The data is said to be of dataset ``name``."""
     return put("data", value={"name": name, **fields})
 
 
@@ -124,9 +123,8 @@ def test_the_place_of_its_data_is_not_opened(
     copy: Path, trap: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, change: Change
 ) -> None:
     forge(copy, run=change)
-    words = [w.format(artifact=copy, out=tmp_path / "out") for w in COMMANDS[command]]
     with untouched(trap):
-        assert main(words) == 2
+        assert main([w.format(artifact=copy, out=tmp_path / "out") for w in COMMANDS[command]]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
     assert "stranger" in error and "--on PACK" in error and not (tmp_path / "out").exists()
 

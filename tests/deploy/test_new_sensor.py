@@ -70,8 +70,7 @@ def model(run: Path, old: Pack) -> Model:
 @pytest.fixture(scope="module")
 def engine(run: Path, old: Pack, new: Pack, tmp_path_factory: pytest.TempPathFactory) -> Engine:
     out = tmp_path_factory.mktemp("export") / "slim"
-    packs = ["--on", str(old.path), OPTION, str(new.path)]
-    assert main(["export", str(run), "--out", str(out), *packs]) == 0
+    assert main(["export", str(run), "--out", str(out), "--on", str(old.path), OPTION, str(new.path)]) == 0
     return Engine(out, threads=1)
 
 

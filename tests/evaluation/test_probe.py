@@ -79,8 +79,7 @@ def test_the_papers_probe_learns_and_repeats() -> None:
     rng = np.random.default_rng(0)
     y = rng.integers(0, 3, 2048)
     x = (10 * np.repeat(np.eye(3)[y], 100, axis=1) + rng.normal(0, 5, (2048, 300))).astype(np.float32)
-    predict = fit_papers(x, [y], [3], seed=0)[0]
-    assert (predict(x).argmax(1) == y).mean() > 0.9
+    assert (fit_papers(x, [y], [3], seed=0)[0](x).argmax(1) == y).mean() > 0.9
     first, same, other = (fit_papers(x[:256], [y[:256]], [3], seed=seed)[0](x) for seed in (0, 0, 1))
     assert np.array_equal(first, same) and not np.array_equal(first, other)
 
@@ -215,8 +214,7 @@ def test_retrieval_of_the_untrained_is_chance(pack: Pack) -> None:
     found = [r for model in models for r in cross_modal(model, pack)]
     assert len(found) == 6 and {r["num_groups"] for r in found} == {12}
     for k in (1, 5, 10):
-        mean = np.mean([r[f"R@{k}"] for r in found])
-        assert mean == pytest.approx(k / 12, abs=0.07)
+        assert np.mean([r[f"R@{k}"] for r in found]) == pytest.approx(k / 12, abs=0.07)
     assert {r["chance R@5"] for r in found} == {5 / 12}
 
 
@@ -228,8 +226,7 @@ def test_retrieval_needs_enough_groups_to_choose_from(result: dict, tmp_path: Pa
     groups[np.isin(groups, names[10:])] = names[0]
     ten = with_columns(ten, group=groups)
     assert len(set(groups[test])) == 10  # the best five of ten are half of them
-    run = recipe("smoke", PackConfig(path=ten.path))
-    assert cross_modal(fresh(run, ten.spec, ten.size), ten) == []
+    assert cross_modal(fresh(recipe("smoke", PackConfig(path=ten.path)), ten.spec, ten.size), ten) == []
 
 
 def test_a_model_of_both_senses_is_probed_on_one(tmp_path: Path) -> None:

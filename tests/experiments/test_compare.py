@@ -117,11 +117,10 @@ def test_a_row_may_read_the_same_samples_in_another_way(pack: Pack, tmp_path: Pa
     """As difference images are: trained and scored on its own pack, beside the others; other samples are refused."""
     dark = altered(Toy(), lambda sample, _: {"touch": sample.touch // 2})
     darker = build(dark, tmp_path / "darker", size=32, quiet=True)
-    fewer = toy_pack(tmp_path / "fewer", num=90)
     rows = (
         Row(label="MViTac"),
         Row(label="darker", set={"data.path": str(darker.path)}),
-        Row(label="fewer", set={"data.path": str(fewer.path)}),
+        Row(label="fewer", set={"data.path": str(toy_pack(tmp_path / "fewer", num=90).path)}),
     )
     session = ProbeConfig(tasks=("pattern",), modalities=("touch",), controls=False)
     work = lay_out(small(pack, rows=rows, seeds=1), pack, tmp_path / "out", session)
@@ -130,8 +129,7 @@ def test_a_row_may_read_the_same_samples_in_another_way(pack: Pack, tmp_path: Pa
     packs = {job.label: json.loads((job.out / "run.json").read_text())["pack"] for job in work.jobs}
     assert packs == {"MViTac": pack.digest, "darker": darker.digest}
     result = gather(work, tmp_path / "out", session)
-    sources = {record["source"] for record in result["records"]}
-    assert {"MViTac", "darker"} <= sources
+    assert {"MViTac", "darker"} <= {record["source"] for record in result["records"]}
     assert result["notes"] == ["darker reads other images than the controls"]
 
 
@@ -226,8 +224,7 @@ def test_changed_fields_are_checked() -> None:
 
 def test_result_and_tables_agree(done: tuple[Path, dict]) -> None:
     out, result = done
-    ends = ("md", "tex", "csv")
-    assert {p.name for p in out.glob("table.*")} == {f"table.{end}" for end in ends}
+    assert {p.name for p in out.glob("table.*")} == {f"table.{end}" for end in ("md", "tex", "csv")}
     lines = {(line.source, line.modality): line for line in lines_of(result)}
     touch = lines["MViTac", "touch"].cells["pattern"]
     keys, wanted = ("source", "modality", "task", "probe"), ("MViTac", "touch", "pattern", "linear")
@@ -488,8 +485,7 @@ def test_killed_and_shared_gives_the_same_table(pack: Pack, tmp_path: Path) -> N
 
 
 def test_the_command_from_dry_run_to_tables(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    plan = write_plan(tmp_path / "plan.json", 2, 1, 2)
-    words = command(pack, plan, tmp_path / "out")
+    words = command(pack, write_plan(tmp_path / "plan.json", 2, 1, 2), tmp_path / "out")
     assert main([*words, "--dry-run"]) == 0
     shown = capsys.readouterr().out
     assert "2 rows x 1 seeds = 2 runs" in shown and not (tmp_path / "out").exists() and "2 runs left" in shown

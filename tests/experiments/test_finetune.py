@@ -257,8 +257,7 @@ def test_bad_input_is_refused_before_anything_is_written(
         edited(pack, tmp_path / "seen", split=lambda row: SWAPPED[row["split"]]): ["has seen what", "--allow-leak"],
     }
     for path, words in cases.items():
-        command = ["finetune", run, "--data", str(path), "--labels", "pattern", "--out", str(out)]
-        assert main(command) == 2
+        assert main(["finetune", run, "--data", str(path), "--labels", "pattern", "--out", str(out)]) == 2
         said = capsys.readouterr().err
         assert said.count("\n") == 1 and all(word in said for word in words), said
     assert main(["finetune", run, "--data", str(pack.path), "--values", "pattern", "--out", str(out)]) == 2

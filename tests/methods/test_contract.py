@@ -46,11 +46,10 @@ def test_on_a_gpu_nothing_stays_behind_and_nothing_is_waited_for(name: str) -> N
     """Losses, update and after_step on torch's fake CUDA tensors, which have a device but no values: an operation over two
     devices raises, and so does whatever would wait for a value."""
     method, batch = build(name).train(), views(build(name))
-    cuda = torch.device("cuda")
     with FakeTensorMode():
 
         def fake(real: torch.Tensor) -> torch.Tensor:
-            return torch.empty(real.shape, dtype=real.dtype, device=cuda)
+            return torch.empty(real.shape, dtype=real.dtype, device=torch.device("cuda"))
 
         moved: dict[int, torch.nn.Parameter] = {}
         for module in method.modules():

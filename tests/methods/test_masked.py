@@ -31,8 +31,7 @@ def spec(**changes: object) -> DataSpec:
 def cut(image: Tensor) -> np.ndarray:
     """[16, 192]: the pixels of the patches of an image [3, 32, 32], in float64."""
     corners = product(range(0, image.shape[1], SIDE), range(0, image.shape[2], SIDE))
-    found = [image[:, y : y + SIDE, x : x + SIDE].reshape(-1) for y, x in corners]
-    return torch.stack(found).double().numpy()
+    return torch.stack([image[:, y : y + SIDE, x : x + SIDE].reshape(-1) for y, x in corners]).double().numpy()
 
 
 def slow_predictor(predictor: Predictor, tokens: Tensor, at: Tensor, hidden: Tensor) -> np.ndarray:

@@ -213,8 +213,7 @@ def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
     linear, nearest = (summarise(result["records"], kind)["kind"]["both"] for kind in ("linear", "knn"))
     for cells in (linear, nearest):
         assert cell_text({"both": cells}, "mvitac", "both") in page.text.replace("\xa0", " ")
-    alone = Page(write_report([first], tmp_path / "alone", quiet=True).read_text())
-    assert "The runs left no log lines." in alone.text
+    assert "The runs left no log lines." in Page(write_report([first], tmp_path / "alone", quiet=True).read_text()).text
 
 
 def test_bars_carry_leaks_and_lines_spare_the_names() -> None:

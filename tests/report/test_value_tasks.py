@@ -32,7 +32,6 @@ from support.training_runs import smoke
 
 
 def one_tested(sample: Sample, item: int) -> dict[str, Any]:
-    """All but one group to learn from, values alone."""
     split = "test" if sample.columns["group"] == "1-4" else "train"
     return {"split": split, "weight": float(item), "label_pattern": None, "label_bright": None}
 

@@ -56,5 +56,4 @@ def built(source: Toy, path: Path, size: int = 32) -> Pack:
 
 def mix_run(*parts: str, **changes: Any) -> Run:
     """A run of the smoke recipe on a mix; ``data`` changes its options."""
-    data = MixConfig(parts=parts, **changes.pop("data", {}))
-    return replace(recipe("smoke", data, phased=False), **changes)
+    return replace(recipe("smoke", MixConfig(parts=parts, **changes.pop("data", {})), phased=False), **changes)

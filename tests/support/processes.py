@@ -34,6 +34,5 @@ def begin(
 
 
 def finish(process: BaseProcess, output: Path | None = None) -> None:
-    """Wait for its end, which has to be a good one."""
     process.join()
     assert process.exitcode == 0, output.read_text() if output else process

@@ -17,7 +17,6 @@ ROWS = torch.arange(3, 83)
 
 
 def small(name: str) -> MethodConfig:
-    """The method's config with narrow heads, where it has any."""
     config = default(MethodConfig, name)
     narrow = {"hidden": 24, "out": 12, "queue": 20, "num_negatives": 9}
     return replace(config, **{key: value for key, value in narrow.items() if hasattr(config, key)})

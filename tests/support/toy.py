@@ -75,12 +75,11 @@ class Toy(Source):
             noisy = wave[:, :, None] + rng.normal(0, 8, (32, 32, channels))
             return np.clip(noisy, 0, 255).astype(np.uint8)
 
-        split = ("train", "train", "val", "test")[instance // 2 % 4]
         columns = {
             "id": f"{item:04d}",
             "group": f"{category}-{instance}",
             "touch_group": f"{category}-{instance}",
-            "split": split,
+            "split": ("train", "train", "val", "test")[instance // 2 % 4],
             "label_pattern": category,
             "label_bright": bright,
             "noise": float(rng.normal()),

@@ -67,7 +67,6 @@ def cut_after(num: int, pack: Pack, out: Path) -> Run:
 
 
 def flip(path: Path) -> None:
-    """Flip a bit in the middle of the largest tensor."""
     with zipfile.ZipFile(path) as archive:
         weights = max(map(archive.read, archive.namelist()), key=len)
     data = bytearray(path.read_bytes())
@@ -249,8 +248,7 @@ def test_positives_are_other_rows_of_the_same_touch(pack: Pack) -> None:
     split = pack.column("split").astype(str)
     rows = np.flatnonzero(split != "test")  # those already in test keep their partner there
     split[groups.argsort(kind="stable")[::2]] = "test"  # one row of each group: its partner must not follow it there
-    halved = with_columns(pack, split=split)
-    assert np.array_equal(draw_positives(halved, rows, torch.Generator().manual_seed(0)), rows)
+    assert np.array_equal(draw_positives(with_columns(pack, split=split), rows, torch.Generator().manual_seed(0)), rows)
 
 
 def asked(run: Run, pack: Pack, rows: np.ndarray, num: int = 2) -> tuple[list[int], dict[str, list[np.ndarray]]]:
@@ -288,8 +286,7 @@ def test_learning_rate_schedules() -> None:
     warm = Optim(lr=1.0, schedule="cosine", warmup=0.1)
     assert [warm.rate(s, 100, 0) for s in (0, 9, 10)] == pytest.approx([0.1, 1.0, 1.0])
     assert warm.rate(55, 100, 0) == pytest.approx(0.5)
-    step = Optim(lr=1.0, schedule="step")
-    assert [step.rate(0, 1, e) for e in (0, 9, 10, 25)] == pytest.approx([1, 1, 0.9, 0.81])
+    assert [Optim(lr=1.0, schedule="step").rate(0, 1, e) for e in (0, 9, 10, 25)] == pytest.approx([1, 1, 0.9, 0.81])
 
 
 @pytest.fixture(scope="module")

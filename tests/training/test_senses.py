@@ -164,6 +164,5 @@ def test_kept_norms_of_one_trunk() -> None:
 
 
 def test_what_cannot_be_locked_is_said(pack: Pack) -> None:
-    locked = replace(TWO, touch=replace(TWO.touch, locked=True))
     with pytest.raises(ValueError, match=r"touch is locked at random weights: give --encoder\.touch\.weights"):
-        smoke(pack, encoder=locked).check(pack.spec, 80, 32)
+        smoke(pack, encoder=replace(TWO, touch=replace(TWO.touch, locked=True))).check(pack.spec, 80, 32)

@@ -182,10 +182,9 @@ def test_leaks_of_ancestors_are_told(pack: Pack, chain: dict[str, Path], capsys:
 def test_pretrain_warns_of_seen_test_rows(
     pack: Pack, chain: dict[str, Path], smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = smoke(pack, steps=1, eval_every=0)
     for name, init in (("clean", smoke_run), ("seen", chain["d"])):
         assert capsys.readouterr().err == ""
-        train(replace(run, init=Init(path=init)), tmp_path / name, quiet=True)
+        train(replace(smoke(pack, steps=1, eval_every=0), init=Init(path=init)), tmp_path / name, quiet=True)
     said = capsys.readouterr().err
     assert said.startswith("mvitac: warning: ") and "has seen what this data tests: 24 of 24" in said
     start = load_run(tmp_path / "seen")[1]["start"]

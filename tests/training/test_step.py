@@ -101,9 +101,8 @@ def test_gradient_caching_is_exact_with_batchnorm_and_dropout_chunk_by_chunk() -
 def test_impossible_steps_are_named(pack: Pack, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="chunk 5: give a divisor of batch_size 16"):
         replace(RUN, chunk=5)
-    run = smoke(pack, chunk=4, method=SupervisedConfig())
     with pytest.raises(ValueError, match="'supervised' supports neither several processes nor --chunk"):
-        train(run, tmp_path / "r", quiet=True)
+        train(smoke(pack, chunk=4, method=SupervisedConfig()), tmp_path / "r", quiet=True)
 
 
 def test_towers_side_by_side_are_those_of_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -175,8 +175,7 @@ def test_a_table_shows_each_evaluation(measured: Pack, tmp_path: Path, capsys: p
         names = [[f"both/linear {task}"] for task in tasks] + [["vision->touch R@5", "touch->vision R@5"]]
         scores = [100 * np.mean([values[name] for name in keys]) for keys in names]
         before, cells = [100 * start[keys[0]] for keys in names[:-1]], said[row].split()
-        shown = cells[1:6] if values is start else cells[3:8]
-        assert shown == [f"{score:.1f}" for score in scores]
+        assert (cells[1:6] if values is start else cells[3:8]) == [f"{score:.1f}" for score in scores]
         assert values is start or cells[-1] == f"{np.mean(scores[:-1]) - np.mean(before):+.1f}"
 
 

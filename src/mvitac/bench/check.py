@@ -198,7 +198,6 @@ Key = tuple[str, str, str, int | None]  # source ("" is the encoder), modality, 
 
 
 def _expected(suite: Suite, ask: SuiteTask, block: dict[str, Any], seeds: Sequence[int], values: bool) -> set[Key]:
-    """The records that a block must have: every modality, probe and seed."""
     few = [few_labels.name(100 * share) for share in ask.labels]
     probes = [*(kind for kind in suite.probes if not values or kind in VALUE_PROBES), *few]
     read = [m for m in ask.modalities if m not in block["left_out"]]

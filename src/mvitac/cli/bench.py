@@ -101,8 +101,7 @@ def board(argv: list[str]) -> None:
 
 
 def check(argv: list[str]) -> None:
-    options = parse(_CheckOptions, argv, "bench check")
-    for path in options.files:
+    for path in parse(_CheckOptions, argv, "bench check").files:
         if loop.is_result(path):
             _, value = loop.read_control(path)
             print(f"{path}: {value['encoder']['name']} on {value['suite']['name']}: {len(value['rows'])} rows hold")

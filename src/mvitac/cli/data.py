@@ -53,15 +53,13 @@ def pack(argv: list[str]) -> None:
     pack = build(data.source(), options.out, **given)
     print(f"{pack.path}: {pack.num} samples at {pack.size} px")
     if lost := pack.meta["damaged"]:
-        first = ": ".join(lost[0])
-        print(f'{len(lost)} left out, listed under "damaged" in {pack.path / "pack.json"}; first {first}')
+        print(f'{len(lost)} left out, listed under "damaged" in {pack.path / "pack.json"}; first {": ".join(lost[0])}')
     print(_groups(pack))
     for note in pack.spec.notes:
         print(fill(f"note: {note}", 80))
 
 
 def _groups(pack: Pack) -> str:
-    """What a group of the pack is and what that does to splits and intervals."""
     sizes = Counter(pack.column("group").tolist()).values()
     rows = " to ".join(map(str, dict.fromkeys((min(sizes), max(sizes)))))
     about = f"groups: {len(sizes)}, one per {pack.spec.group_by}, of {rows} row{'s' * (rows != '1')} each. "

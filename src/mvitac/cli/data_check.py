@@ -70,8 +70,7 @@ def check(argv: list[str]) -> int:
         return _report(str(data.path), examine_pack(data.path, draw_sheet), options)
     # A leak is a finding here, beside all the others; packing refuses it.
     source = (replace(data, allow_leak=True) if isinstance(data, RowsConfig) else data).source()
-    findings = examine_source(source, workers=data.workers, quiet=options.quiet, draw=draw_sheet)
-    return _report(name, findings, options)
+    return _report(name, examine_source(source, workers=data.workers, quiet=options.quiet, draw=draw_sheet), options)
 
 
 def _sheet(what: str, options: _Options) -> Draw | None:

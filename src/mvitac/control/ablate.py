@@ -160,8 +160,7 @@ def lerobot_policy(folder: Path) -> Policy:
         from lerobot.policies.factory import get_policy_class, make_pre_post_processors  # type: ignore[import-not-found]
     except ImportError as error:
         raise ValueError(f"{folder} is a LeRobot policy, and lerobot cannot be imported ({error})") from None
-    kind = PreTrainedConfig.from_pretrained(folder).type
-    policy = get_policy_class(kind).from_pretrained(folder).eval()
+    policy = get_policy_class(PreTrainedConfig.from_pretrained(folder).type).from_pretrained(folder).eval()
     before, after = make_pre_post_processors(policy.config, str(folder))
 
     @torch.no_grad()

@@ -34,8 +34,7 @@ class LoopEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         super().reset(seed=seed)
-        number = int(self.np_random.integers(2**31)) if seed is None else seed
-        self.world = self.suite.world(*self.cell, number)
+        self.world = self.suite.world(*self.cell, int(self.np_random.integers(2**31)) if seed is None else seed)
         return self._seen(), self._info()
 
     def step(self, action: np.ndarray) -> Any:

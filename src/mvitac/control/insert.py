@@ -58,8 +58,7 @@ def draw_peg(seed: int, number: int, trained: bool) -> tuple[Peg, float]:
     """The peg of an episode in its hand, and the place of the slot in mm."""
     rng = np.random.default_rng([_TAG, seed, int(trained), number])
     slot, offset, turn = (float(rng.uniform(-most, most)) for most in REACH.values())
-    own = {"half_mm": 3.5, "offset_mm": offset, "turn_deg": turn}
-    return Peg(**{**vars(_held(seed)[0]), **own}), slot
+    return Peg(**{**vars(_held(seed)[0]), "half_mm": 3.5, "offset_mm": offset, "turn_deg": turn}), slot
 
 
 class Insertion:
@@ -106,7 +105,6 @@ class Insertion:
         return float(mm <= suite.success_mm and deg <= suite.success_deg and deep), mm, deg
 
     def _go(self, place: np.ndarray, steps: int) -> None:
-        """Move the set point there and let physics follow."""
         self.place, self.steps, self.over = place, steps, steps == ALIGN + DOWN
         self.values = {"state": place.copy()}
         half, down = math.radians(place[1]) / 2, max(0, steps - ALIGN) / DOWN

@@ -228,8 +228,7 @@ def begun(kind: str, key: tuple[int, ...]) -> tuple[Shape, np.ndarray]:
     """Shape and first state of an episode, the same with every sensor; its texture is one that no press had."""
     task, rng = task_of(kind), np.random.default_rng([_DRAW, *key])
     shape = draw_shape(rng, kind, textures(False))
-    pose = task.target + rng.uniform(-1, 1, len(task.target)) * task.start
-    return shape, task.state(shape, pose, 0.0)
+    return shape, task.state(shape, task.target + rng.uniform(-1, 1, len(task.target)) * task.start, 0.0)
 
 
 def picture(asked: tuple[str, tuple[int, ...], bool, float, np.ndarray, int]) -> np.ndarray:

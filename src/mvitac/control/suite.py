@@ -106,8 +106,7 @@ def _run(suite: Any, worlds: Sequence[Any], estimate: Estimate | None, shuffle: 
         images = suite.look(worlds, sense)
         if not shuffle or sense != "touch":
             return images
-        by_cell = images.reshape(-1, suite.num, *images.shape[1:])
-        return np.roll(by_cell, -suite.other, axis=1).reshape(images.shape)
+        return np.roll(images.reshape(-1, suite.num, *images.shape[1:]), -suite.other, axis=1).reshape(images.shape)
 
     while not worlds[0].over:
         known = np.stack([world.known for world in worlds])

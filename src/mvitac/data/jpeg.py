@@ -42,8 +42,7 @@ def decode(jpeg: bytes, shape: tuple[int, int, int]) -> np.ndarray:
     height, width, colours, _ = simplejpeg.decode_jpeg_header(jpeg)
     if (height, width, colours) != (size * channels // 3, size, "YCbCr"):
         raise ValueError(f"it is {colours} of {width} x {height}")
-    sensors = simplejpeg.decode_jpeg(jpeg).reshape(-1, size, size, 3)
-    return sensors.transpose(1, 2, 0, 3).reshape(shape)
+    return simplejpeg.decode_jpeg(jpeg).reshape(-1, size, size, 3).transpose(1, 2, 0, 3).reshape(shape)
 
 
 class Jpegs(Lazy):

@@ -248,8 +248,7 @@ class Pack:
         """Return the row numbers of a touch group (or press), ascending."""
         if of not in self._rows_by:
             numbers = getattr(self, of)
-            order = np.argsort(numbers, kind="stable")
-            self._rows_by[of] = np.split(order, np.cumsum(np.bincount(numbers))[:-1])
+            self._rows_by[of] = np.split(np.argsort(numbers, kind="stable"), np.cumsum(np.bincount(numbers))[:-1])
         return self._rows_by[of][number]
 
     def _check_digest(self, name: str) -> None:

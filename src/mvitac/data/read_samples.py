@@ -77,7 +77,6 @@ class Reader:
         return part, {m: b"".join(rows) for m, rows in stored.items()}
 
     def _image(self, sample: Sample, modality: str) -> bytes:
-        """Return the stored bytes of an image; ValueError if it is none."""
         image, channels = getattr(sample, modality), self.spec.channels(modality)
         if (image is None) != (sample.columns.get(f"has_{modality}", True) is False):
             raise ValueError(f"{'no' if image is None else 'a'} {modality} image, against its column has_{modality}")

@@ -74,8 +74,7 @@ def frame_times(path: str | Path) -> np.ndarray:
 
 def spread(num: int, length: int, start: float = 0.0, end: float = 1.0) -> list[int]:
     """Return at most ``num`` distinct frame numbers, evenly spaced between fractions ``start`` and ``end`` of ``length``."""
-    places = np.linspace(start * (length - 1), end * (length - 1), num)
-    return sorted({int(place) for place in np.rint(places)})
+    return sorted({int(place) for place in np.rint(np.linspace(start * (length - 1), end * (length - 1), num))})
 
 
 def frames(
@@ -196,7 +195,6 @@ def _shown(packet: Packet) -> int:
 
 @contextlib.contextmanager
 def _opened(path: str | Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """Open a file and its video stream; errors name the file and say what to do."""
     if Path(path).exists() and not Path(path).is_file():
         raise ValueError(f"{path} is no file: a pipe would be waited for for ever")
     try:

@@ -262,8 +262,7 @@ def split_objects(config: CalandraConfig, names: Sequence[str]) -> dict[str, str
         splits |= {name: "test" for name in names if name in AUTHORS_TEST}
     else:
         shuffled = owners_shuffle(names, config.split_seed)
-        num_train = int(0.75 * len(shuffled))
-        splits = {name: "train" if i < num_train else "test" for i, name in enumerate(shuffled)}
+        splits = {name: "train" if i < int(0.75 * len(shuffled)) else "test" for i, name in enumerate(shuffled)}
     if not names:
         raise ValueError(f"{config.path} holds no grasp that can be read: see its files, or download them again")
     if not splits:

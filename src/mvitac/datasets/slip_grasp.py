@@ -42,9 +42,7 @@ class SlipGraspConfig(RowsConfig):
 
     def manifest(self) -> Manifest:
         root = in_clone(self.path, "data", "object*_result.dat", self.source_url)
-        rows: list[dict[str, str]] = []
-        for file in sorted(root.glob("object*_result.dat")):
-            rows += _grasps(root, file)
+        rows = [row for file in sorted(root.glob("object*_result.dat")) for row in _grasps(root, file)]
         objects = [row["object"] for row in rows]
         add_folds(rows, objects, len(set(objects)), val_every=1)
         return Manifest.of(root, rows)

@@ -74,6 +74,5 @@ class SlipGSMiniConfig(RowsConfig):
         often: dict[str, list[int]] = {}
         for row in rows:
             often.setdefault(row["object"], []).append(int(row["slip"] or 0))
-        strata = [f"{sum(often[row['object']]) / len(often[row['object']]):.2f}" for row in rows]
-        add_folds(rows, strata, 3)
+        add_folds(rows, [f"{sum(often[row['object']]) / len(often[row['object']]):.2f}" for row in rows], 3)
         return Manifest.of(root, rows)

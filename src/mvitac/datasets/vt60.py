@@ -55,6 +55,5 @@ class VT60Config(RowsConfig):
 
 
 def _by_number(folder: Path) -> list[Path]:
-    """Return the images of ``folder``, sorted by the number after img_, then by name."""
     numbers = {path: re.search(r"img_(\d+)", path.name) for path in folder.glob("*.jpg")}
     return sorted(numbers, key=lambda path: (int(found[1]) if (found := numbers[path]) else -1, path.name))

@@ -51,8 +51,7 @@ def card(model: Model, about: dict[str, Any]) -> str:
 
 def _harmless(value: object) -> str:
     """Text in which labels and notes of the data make no line, HTML, image, link or terminal escape in Markdown."""
-    text = "".join(c if c.isprintable() else " " for c in str(value))
-    return text.replace("<", "&lt;").replace("](", r"]\(")
+    return "".join(c if c.isprintable() else " " for c in str(value)).replace("<", "&lt;").replace("](", r"]\(")
 
 
 def _tables(model: Model, scores: dict[str, Any]) -> list[str]:

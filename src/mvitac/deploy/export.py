@@ -112,7 +112,6 @@ def _checked(path: Path, precision: str, check: Callable[[Call], Any]) -> tuple[
 
 
 def _examples(graph: ExportModule, pack: Pack) -> list[list[np.ndarray]]:
-    """Single real inputs: a sample of the train rows of ``pack``."""
     rows = pack.rows("train", "unlabelled", having=graph.modalities)
     if not len(rows):
         raise ValueError(f"{pack.path} has no rows in split train: int8 takes its ranges from them")

@@ -172,8 +172,7 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
         model.save(partial / "model.safetensors", half=half)
         if model.probes:
             tensors = {f"{r.info.name}.{k}": v for r in model.probes.values() for k, v in r.state_dict().items()}
-            data = safetensors.torch.save(tensors)
-            write_atomic(partial / "probes.safetensors", lambda file: file.write(data))
+            write_atomic(partial / "probes.safetensors", lambda file: file.write(safetensors.torch.save(tensors)))
         write_json(partial / "run.json", record, sealed=True)
         if learned is not None:
             shutil.copy(run / FILE, partial)

@@ -92,9 +92,8 @@ def retrieval_ranks(
     gallery = F.normalize(gallery.float(), dim=1)
     sums = torch.zeros(int(groups.max()) + 1, gallery.shape[1]).index_add_(0, groups, gallery)
     similarity = F.normalize(query.float(), dim=1) @ F.normalize(sums, dim=1).T
-    own = similarity.gather(1, groups[:, None])
     # Ties count against the query, or constant embeddings would score.
-    return (similarity >= own).sum(1) - 1
+    return (similarity >= similarity.gather(1, groups[:, None])).sum(1) - 1
 
 
 def recall_at(ranks: Int[Tensor, " N"], ks: Sequence[int] = (1, 5, 10)) -> dict[str, float]:

@@ -87,10 +87,9 @@ def probe_runs(
     names = [name + ", best" * (weights == "best") for name in names_of(paths, models)]
     pack = _common_pack(paths, models, pack)
     tasks, modalities = chosen(pack, session)
-    _check_reads([*zip(names, models, strict=True), *((model.title, model) for model, _ in others)], pack, modalities)
+    _check_rows(names, models, others, pack, modalities)
     if session.standardise and (others or {*modalities} <= {"vision"}):
         raise ValueError("--standardise changes the touch features of runs, not of vision or an --encoder")
-    _check_names({*names}, {model.title for model, _ in others}, {*CONTROLS, *pack.spec.controls})
     for model in models:
         fitting(model, pack)
     # The initial weights that an artifact names may be any file or download.
@@ -122,13 +121,11 @@ def probe_runs(
     return result
 
 
-def _check_reads(models: Sequence[tuple[str, Any]], pack: Pack, modalities: Sequence[str]) -> None:
-    for name, model in models:
+def _check_rows(names: list[str], models: list[Model], others: Any, pack: Pack, modalities: Sequence[str]) -> None:
+    for name, model in [*zip(names, models, strict=True), *((model.title, model) for model, _ in others)]:
         if not any({*names_in(m, pack)} <= {*model.encoders} for m in modalities):
             raise ValueError(f"{name} does not read {' or '.join(modalities)}: choose other --modalities")
-
-
-def _check_names(runs: set[str], encoders: set[str], controls: set[str]) -> None:
+    runs, encoders, controls = {*names}, {model.title for model, _ in others}, {*CONTROLS, *pack.spec.controls}
     if alike := encoders & runs | (encoders | runs) & controls:
         raise ValueError(f"two rows would be called {min(alike)!r}: give a title=NAME, or rename the data's control")
 

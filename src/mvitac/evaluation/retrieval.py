@@ -16,8 +16,7 @@ MIN_GALLERY = 11  # least number of test groups; with fewer, the first five are 
 
 def retrieved_rows(pack: Pack, *splits: str) -> np.ndarray:
     """Rows of ``splits`` with all modalities, of the phase that the first task is about."""
-    only = pack.spec.tasks[0].only if pack.spec.tasks else None
-    return pack.rows(*splits, only=only, having=pack.spec.modalities)
+    return pack.rows(*splits, only=pack.spec.tasks[0].only if pack.spec.tasks else None, having=pack.spec.modalities)
 
 
 def cross_modal(model: Model, pack: Pack) -> list[dict[str, Any]]:

@@ -75,8 +75,7 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str
             if (job.out / "run.json").exists():
                 check_same(job.run, own, job.out)
             jobs.append(job)
-    others = [row.label for row, own in possible if _images(own) != _images(pack)]
-    return Work(plan, pack, jobs, left_out, others)
+    return Work(plan, pack, jobs, left_out, [row.label for row, own in possible if _images(own) != _images(pack)])
 
 
 def _images(pack: Pack) -> dict[str, str]:
@@ -138,8 +137,7 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
 
 def _scores(job: Job) -> tuple[Records, Records]:
     scores = read_json(job.out / "scores.json", "a run's scores")
-    method = job.run.method.name
-    named = [{**r, "source": job.label + r["source"].removeprefix(method)} for r in scores["records"]]
+    named = [{**r, "source": job.label + r["source"].removeprefix(job.run.method.name)} for r in scores["records"]]
     return named, [{**found, "source": job.label} for found in scores["retrieval"]]
 
 

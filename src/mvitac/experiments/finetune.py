@@ -164,8 +164,7 @@ def _run_of(model: Model, init: Init, data: DatasetConfig, pack: Pack, method: S
     run = replace(start, recipe="finetune", data=data, method=method, optim=OPTIM, precision="auto")
     run = replace(run, init=replace(init, modalities=method.modalities).resolved() if init else init)
     views: Any = {m: replace(LIGHT, size=side) for m, side in sides.items()}
-    augment = Augment(size=max(sides.values()), **views)
-    run = replace(run, augment=augment, sampler="shuffle", positives="same-image")
+    run = replace(run, augment=Augment(size=max(sides.values()), **views), sampler="shuffle", positives="same-image")
     return replace(run, chunk=0, eval_every=0, checkpoint_every=0)
 
 
@@ -253,8 +252,7 @@ def _fraction(job: _Job, percent: float, sources: list[Source] | None) -> tuple[
             scores = {"data": job.pack.spec.name, "pack": job.pack.digest, "records": own}
             write_json(path / "scores.json", scores, sealed=True)
             records += own
-        frozen = [_frozen(job, percent, seed, task) for task in job.tasks]
-        records += job.named(frozen, FROZEN, percent, seed, sources)
+        records += job.named([_frozen(job, percent, seed, task) for task in job.tasks], FROZEN, percent, seed, sources)
     return records, settings
 
 

@@ -73,8 +73,7 @@ def pack_tables(engine: Engine, pack: Pack, about: Sequence[str] = ("group", "sp
     known = [name for name in ("time", "contact", "id", *about) if name in pack.table.column_names]
     chunks = np.split(rows, range(BATCH, len(rows), BATCH))
     for some, images in prefetch((some, {m: pack.images[m][some] for m in engine.inputs}) for some in chunks):
-        told = {name: pack.column(name)[some] for name in known}
-        yield {"frame": some, **told, **answers(engine, engine(**images))}
+        yield {"frame": some, **{name: pack.column(name)[some] for name in known}, **answers(engine, engine(**images))}
 
 
 class Recordings:

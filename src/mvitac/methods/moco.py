@@ -69,8 +69,7 @@ class MoCo(Contrastive, config=MoCoConfig):
         self.pending: dict[str, Tensor] = {}
 
     def prepare(self, rows: Tensor) -> None:
-        size = self.config.queue_size(len(rows))
-        self.queues = nn.ModuleDict({m: Queue(size, self.config.out) for m in self.towers})
+        self.queues = nn.ModuleDict({m: Queue(self.config.queue_size(len(rows)), self.config.out) for m in self.towers})
 
     def queries(self, batch: Views) -> Embeddings:
         return {("q", m): tower(batch.images[m][0]) for m, tower in present(self.towers, batch)}

@@ -61,7 +61,6 @@ def print_summary(result: dict[str, Any], file: TextIO | None = None, *, probe: 
 
 
 def _print_notes(result: dict[str, Any], records: Sequence[dict[str, Any]], file: TextIO | None) -> None:
-    """Print what the intervals of ``records`` cover, and what limits the result."""
     said = f"95 % intervals: {score_text.covered(result['group_by'], records)}."
     print(textwrap.fill(said, 80, subsequent_indent="  "), file=file)
     for kind, key in (("note", "notes"), ("LEAK", "leaks")):

@@ -38,8 +38,7 @@ def in_branches(branches: Sequence[Callable[[], dict[Hashable, Tensor]]]) -> dic
 
     def in_this_mode(branch: Callable[[], dict[Hashable, Tensor]]) -> dict[Hashable, Tensor]:
         # A new thread has none of these modes. All threads share autocast's cache, and the first to end clears it.
-        cast = torch.autocast("cpu", cpu[1], enabled=cpu[0], cache_enabled=False)
-        with cast, torch.set_grad_enabled(cpu[2]):
+        with torch.autocast("cpu", cpu[1], enabled=cpu[0], cache_enabled=False), torch.set_grad_enabled(cpu[2]):
             return branch()
 
     named: list[Hashable] = []

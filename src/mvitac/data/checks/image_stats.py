@@ -46,8 +46,7 @@ def look_at(pack: Pack) -> dict[str, ImageStats]:
         num_sensors = pack.spec.channels(modality) // 3
         for sensor in range(num_sensors):
             name = modality if num_sensors == 1 else f"{modality} {sensor + 1}"
-            channels = slice(3 * sensor, 3 * sensor + 3)
-            found[name] = _look(modality, pack.images[modality], channels, pack.has(modality))
+            found[name] = _look(modality, pack.images[modality], slice(3 * sensor, 3 * sensor + 3), pack.has(modality))
     return found
 
 

@@ -157,7 +157,6 @@ def _episodes(demo: str, ends: Any, num: int) -> list[tuple[str, int]]:
 
 
 def _holds_images(data: Any) -> bool:
-    """Whether a dataset holds images as numbers, or bytes of JPEG or PNG files."""
     if data.ndim == 4:
         return True
     of_bytes = data.ndim == 1 and data.dtype.kind in "SVO"

@@ -46,7 +46,6 @@ def list_images(root: Path, plain: str, every: int | None) -> Manifest:
 
 
 def _split_rows(root: Path, split: str, plain: str, every: int) -> list[Row]:
-    """Return the rows of the images in folder ``split`` ("" = ``root`` itself)."""
     base = root / split
     named = [name for name in CAMERAS if (base / name).is_dir()]
     found = {name: _images_below(base / name) for name in named} or {plain: _images_below(base)}
@@ -126,12 +125,10 @@ def list_videos(path: Path, names: Sequence[str], plain: str, every: int | None,
             away = max(away, float(apart[i]))
             rows.append(recording_row(recording, int(shown[i]), float(own[shown[i]])))
             for camera in cameras:
-                ref = Frame(str(files[camera]), int(at[camera][0][i])) if camera in files else None
-                images[camera].append(ref)
+                images[camera].append(Frame(str(files[camera]), int(at[camera][0][i])) if camera in files else None)
     note = f"{' and '.join(cameras)} are paired by time, at most {away:.3g} s apart"
     note += f"; {alone} frames without a partner within {tolerance:g} s are left out" * bool(alone)
-    notes = (note,) if len(cameras) > 1 else ()
-    return Manifest.of(path, rows, images, group="recording", notes=notes)
+    return Manifest.of(path, rows, images, group="recording", notes=(note,) if len(cameras) > 1 else ())
 
 
 def recording_row(recording: str, frame: int, time: float | None) -> Row:

@@ -72,7 +72,6 @@ def _is_image(kind: pa.DataType) -> bool:
 
 
 def _there(opened: pq.ParquetFile, group: int, column: str, num: int) -> list[bool]:
-    """Return which images of a row group are not null."""
     leaves = [opened.schema.column(i).path for i in range(len(opened.schema.names))]
     leaf = next(i for i, path in enumerate(leaves) if path in (column, f"{column}.bytes"))
     nulls = opened.metadata.row_group(group).column(leaf).statistics

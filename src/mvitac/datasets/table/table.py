@@ -250,7 +250,6 @@ class Rows(Source):
         parse_json(json.dumps([to_json(self._spec), [*{*groups}]], ensure_ascii=False))  # or no result could be read
 
     def _check_used(self, table: Manifest) -> None:
-        """ValueError for an option that changes nothing of this table."""
         config, listed = self._config, table.path.suffix.lower() in READERS
         idle: dict[str, Any] = {"pictures": listed and "the table names its images"}
         alone = listed and not config.log and "--data.log names no other clock"
@@ -262,7 +261,6 @@ class Rows(Source):
                 raise ValueError(f"--data.{name.replace('_', '-')} has no effect, {why}: leave it out")
 
     def _groups(self, table: Manifest) -> tuple[str, list[str], list[str]]:
-        """Return what groups the rows, and each row's group and touch group."""
         if self._group:
             group_by, groups = self._group, table.filled(self._group, "group")
         else:
