@@ -1,5 +1,6 @@
 """The bench: one protocol for any encoder, results that cannot be changed unseen, and a page that compares them."""
 
+import copy
 import json
 import re
 import shutil
@@ -47,7 +48,7 @@ name = "stripes"
 names = ["Toy Stripes"]
 tasks = [
     {{ name = "pattern", modalities = ["touch", "both"], labels = [0.3] }},
-    {{ name = "light", modalities = ["touch"] }},
+    {{ name = "light", modalities = ["touch"], labels = [0.3] }},
 ]
 [[sets.forms]]
 name = "pack"
@@ -299,6 +300,24 @@ def worse_mean(factor: float, folds: int, value: dict[str, Any]) -> None:
         sums[name] = [[times * x for x in each] for each in sums[name]]
 
 
+def other_share(value: dict[str, Any]) -> None:
+    """A probe on all labels has the sums of one on few, in one control."""
+    records = [record for record in value["blocks"][1]["records"] if record["source"] == "untrained"]
+    few, linear = (next(r for r in records if (r["seed"], r["probe"]) == (0, kind)) for kind in (FEW, "linear"))
+    linear["sums"] = few["sums"]
+
+
+def best_seed(value: dict[str, Any]) -> None:
+    """A second seed, which is another in classes, has the first one's values."""
+    value["encoder"]["seeds"], value["encoder"]["weights"] = [0, 1], [value["encoder"]["weights"][0], "0" * 64]
+    for block in (block for block in value["blocks"] if "records" in block):
+        block["leaks"] *= 2
+        again = [{**copy.deepcopy(record), "seed": 1} for record in block["records"] if not record["source"]]
+        for record in again if block["task"] == "pattern" else ():
+            record["sums"]["correct"][0] = 1 - min(1, record["sums"]["correct"][0])
+        block["records"] += again
+
+
 def copied(to: str, of: str, value: dict[str, Any], names: Sequence[str] = ("sums", "clipped")) -> None:
     """The values of one source, in its last seed, are those that another one says in its first."""
     records = value["blocks"][1]["records"]
@@ -388,16 +407,18 @@ FORGED: dict[str, tuple[Change, str]] = {
     "field of a block": (put("blocks", 0, "mine", value=1), "has the unknown field 'mine'"),
     "field of the encoder": (put("encoder", "mine", value=1), "has the unknown field 'mine'"),
     "field of the network": (put("encoder", "external", value={"mine": 1}), "has the unknown field 'mine'"),
-    "no imagenet": (lambda value: value["blocks"][1].pop("notes"), "lacks imagenet, touch, linear, None"),
+    "no imagenet": (lambda value: value["blocks"][1].pop("notes"), "lacks imagenet, touch, "),
     "a truth for a count": (put(*RECORDS, 0, "sums", "correct", 0, value=True), "its sums are no numbers"),
     "all guesses right": (all_right, "one answer is right for all rows"),
     "a worse mean": (partial(worse_mean, 3, 0), "its errors are not those of one answer$"),
+    "another share of labels": (other_share, "light: touch, untrained, .* has the sums of linear"),
+    "best seed": (best_seed, "the encoder by touch: seeds 0 and 1 have the same values in some tasks"),
     "a mean of folds": (partial(worse_mean, 1.02, 3), "its errors are not those of one answer per fold"),
     "a mean of a group": (partial(worse_mean, 9, 99), "its errors are not those of one answer per fold"),
     "a better mean": (partial(worse_mean, 0.02, 99), "its errors are not those of one answer per fold"),
-    "values of pixels": (partial(copied, "", "pixels"), "light: touch, the encoder, linear, seed 0: has the sums of"),
+    "values of pixels": (partial(copied, "", "pixels"), "light: touch, the encoder, .* has the sums of touch"),
     "controls alike": (partial(copied, "border", "pixels"), "touch, .*, linear, seed None: has the sums of touch, "),
-    "a control knows nothing": (partial(copied, "untrained", "mean"), "linear, seed 1: has the sums of mean"),
+    "a control knows nothing": (partial(copied, "untrained", "mean"), "untrained, .* has the sums of mean"),
     "sums of a network": (partial(copied, "", "untrained", names=["sums"]), "the encoder, linear, seed 0: has"),
     "seeds alike": (partial(copied, "untrained", "untrained"), "untrained, linear, seed 0: has the sums of"),
     "no unit": (put(*VALUES, "targets", value=[["light"]]), "not names and units"),

@@ -1,5 +1,6 @@
 """ROS bags, written by rosbags itself: image and wrench topics joined by time."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -125,6 +126,17 @@ def test_messages_that_are_not_there_are_told(tmp_path: Path) -> None:
     ref = Message(str(bag), FRONT, START * 10**9, 9)
     with pytest.raises(ValueError, match="number 9 is not found again: its files are"), ref.opened() as opened:
         ref.stored(opened)
+
+
+def test_a_bag_that_is_cut_or_no_file(tmp_path: Path) -> None:
+    file = next(write_bag(tmp_path / "bag", StoragePlugin.SQLITE3, 0).glob("*.db3"))
+    file.write_bytes(file.read_bytes()[:-100])  # sqlite reads the end as zeros
+    with pytest.raises(ValueError, match=r"db3 is cut off: fetch it again"):
+        packed(RosbagConfig(path=tmp_path / "bag", touch=(GEL,)), tmp_path / "pack")
+    file.unlink()
+    os.mkfifo(file)  # reading it would wait for ever
+    with pytest.raises(ValueError, match="neither a file nor a folder"):
+        packed(RosbagConfig(path=tmp_path / "bag", touch=(GEL,)), tmp_path / "pack")
 
 
 def test_a_short_image_is_named(tmp_path: Path) -> None:

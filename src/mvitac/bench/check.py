@@ -10,7 +10,7 @@ import numpy as np
 
 from mvitac.bench.external.adapters import parse
 from mvitac.bench.result import COUNTS, KEY, VOLATILE, pinned_of, suite_of
-from mvitac.bench.suite import Suite, SuiteSet, SuiteTask
+from mvitac.bench.suite import Suite, SuiteSet, SuiteTask, simulated_spec
 from mvitac.data.spec import MODALITIES
 from mvitac.datasets.table.columns import value_task
 from mvitac.evaluation import few_labels
@@ -48,6 +48,7 @@ def problems(value: dict[str, Any]) -> list[str]:
     for (one, first), (other, second) in itertools.combinations(several, 2):
         if one == other and several[one, first] == several[other, second] and len(several[one, first]) > 1:
             found.append(f"{one or 'the encoder'} has the same sums in every record of seeds {first} and {second}")
+    found += _seeds_alike(value["blocks"])
     asked = [(one, ask) for one in suite.sets for ask in one.tasks]
     if (want := [(s.name, t.name) for s, t in asked]) != (have := [(b["set"], b["task"]) for b in value["blocks"]]):
         return [*found, f"has the tasks {have}, the suite asks for {want}"]
@@ -73,6 +74,22 @@ def problems(value: dict[str, Any]) -> list[str]:
         if "not_run" not in block:
             found += [f"{one.name}, {ask.name}: {text}" for text in _of_block(block, suite, one, ask, encoder)]
     return found
+
+
+def _seeds_alike(blocks: Sequence[dict[str, Any]]) -> list[str]:
+    """Seeds with the same values in a task (by ridge, which no two features give) that differ in another."""
+    alike: dict[Any, set[bool]] = {}
+    for records in (block.get("records", ()) for block in blocks):
+        none = [record["sums"] for record in records if record["modality"] == "none"]
+        own = [record for record in records if not record["source"] and record["sums"] not in none]
+        for one, other in itertools.combinations(own, 2):
+            same, sure = one["sums"] == other["sums"], "targets" in one and one["probe"] != "knn"
+            if one["modality"] == other["modality"] and one["probe"] == other["probe"] and (sure or not same):
+                alike.setdefault((one["modality"], one["seed"], other["seed"]), set()).add(same)
+    pairs = [key for key, found in alike.items() if len(found) > 1]
+    return [
+        f"the encoder by {m}: seeds {one} and {other} have the same values in some tasks" for m, one, other in pairs
+    ]
 
 
 def _senses(modality: str) -> set[str]:
@@ -153,6 +170,8 @@ def _of_block(
     have = Counter((r["source"], r["modality"], r["probe"], r["seed"]) for r in records)
     want = _expected(suite, ask, block, encoder["seeds"], "targets" in records[0] if records else False)
     asked = [text for form in one.forms if form.name == block["form"] for text in form.data.get("controls", ())]
+    made = [spec for form in one.forms if form.name == block["form"] and (spec := simulated_spec(form))]
+    asked += [name for spec in made for name in spec.controls]
     want |= {((text.rpartition("=")[0] or text).strip(), "none", "linear", None) for text in asked}
     own = {key for key in have if key[1:] == ("none", "linear", None) and key[0] not in CONTROLS}  # columns of the data
     for what, keys in (("lacks", want - have.keys()), ("has too much of", have.keys() - want - own)):
@@ -170,7 +189,8 @@ def _of_block(
             yield f"{what}: is scored on other rows than those above it"
     yield from _copies([record for record in records if "targets" in record])
     forms = [form.data for form in one.forms if form.name == block["form"]]
-    for task in (value_task(text) for data in forms for text in data.get("values", ())):
+    tasks = [value_task(text) for data in forms for text in data.get("values", ())]
+    for task in (*tasks, *(task for spec in made for task in spec.values)):
         named, given = [[target.name, target.unit] for target in task.targets], [r.get("targets") for r in records[:1]]
         if task.name == block["task"] and given and given != [named]:
             yield f"its values are {given[0]}, those of the suite {named}"
@@ -189,6 +209,15 @@ def _copies(records: Sequence[dict[str, Any]]) -> Iterator[str]:
         same = one["modality"] == other["modality"] and one["sums"] == other["sums"] and one["sums"] not in mean
         if same and apart and (fixed or one.get("clipped") != other.get("clipped")):
             yield f"{_who(one)}: has the sums of {_who(other)}"
+    fits: dict[
+        tuple[str, str], list[tuple[Any, bool]]
+    ] = {}  # two probes -> whether each of their fits has the same sums
+    for one, other in itertools.combinations([r for r in records if r["sums"] not in mean], 2):
+        if one["probe"] != other["probe"] and all(one[key] == other[key] for key in ("source", "modality", "seed")):
+            fits.setdefault((one["probe"], other["probe"]), []).append((other, one["sums"] == other["sums"]))
+    for (probe, _), some in fits.items():
+        if any(same for _, same in some) and not all(same for _, same in some):  # they may be fitted on the same rows
+            yield f"{_who(next(r for r, same in some if same))}: has the sums of {probe}"
     for record in records:
         if record["source"] in ("pixels", "untrained", "imagenet") and record["sums"] in mean:
             yield f"{_who(record)}: has the sums of mean"

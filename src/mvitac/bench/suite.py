@@ -16,7 +16,7 @@ import numpy as np
 from mvitac.bench.external.adapters import parse
 from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack
-from mvitac.data.spec import AnyTask, Task
+from mvitac.data.spec import AnyTask, DataSpec, Task
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.table.splits import folds
 from mvitac.evaluation.probe import VALUE_PROBES
@@ -154,6 +154,11 @@ def _check_places(form: Form, config: DatasetConfig) -> None:
 def _config(form: Form, root: Path, options: dict[str, Any]) -> DatasetConfig:
     places = {option: str(root / place) for option, place in form.at.items()}
     return from_json(DatasetConfig, {**options, **places}, "data")
+
+
+def simulated_spec(form: Form) -> DataSpec | None:
+    """The spec of data that needs no files; None of other data."""
+    return None if form.at else _config(form, Path(), form.data).source().spec()
 
 
 @dataclass(frozen=True)

@@ -188,7 +188,9 @@ def predict(argv: list[str]) -> None:
     if not (engine.classes or engine.values):
         raise ValueError(f"{options.model} has no probes of classes or values: export it on data that has labels")
     if config:
-        pack = _opened(config, given, next(iter(engine.inputs.values()))[0])
+        pack = _opened(config, given, engine)
+        for note in (note for note in pack.spec.notes if "left out" in note):
+            _say(f"note: {note}")
         for m in [m for m in engine.inputs if pack.spec.crop.get(m) != engine.crop.get(m)]:
             have, wanted = (crop.get(m, "whole images") for crop in (pack.spec.crop, engine.crop))
             _say(f"mvitac: warning: {m} shows {have}, the model learned from {wanted}: pack it with --crop")
@@ -210,12 +212,14 @@ def predict(argv: list[str]) -> None:
         _say(f"contact is not known: no {options.live.calibration} frames without it, and no --background")
 
 
-def _opened(config: Any, names: Mapping[str, Sequence[str]], side: int) -> Pack:
-    """Every image of ``config`` at ``side`` px; ``names`` are those of its images by modality, where it has names."""
+def _opened(config: Any, names: Mapping[str, Sequence[str]], engine: Engine) -> Pack:
+    """Every image of ``config`` as ``engine`` takes it; ``names``: modality -> its images, where they have names."""
     if isinstance(config, PackConfig):
         return config.open()
     given: dict[str, Any] = {"vision": names["vision"][0] if names["vision"] else None, "touch": names["touch"] or None}
     given |= {"every": 1} if hasattr(config, "every") else {}
+    given |= {"difference": engine.difference} if hasattr(config, "difference") else {}
+    side = next(iter(engine.inputs.values()))[0]
     return replace(config, size=side, **{name: value for name, value in given.items() if value}).open()
 
 

@@ -123,7 +123,12 @@ def _check_choices(rest: Sequence[str], text: Path) -> None:
             continue
         option, choices = known[1], known[2].split("|")
         value = next(iter(rest[rest.index(option) + 1 :]), choices[0])
-        if value not in choices and not Path(value).exists():
+        if value in choices or Path(value).exists():
+            continue
+        if option in ("--data", "--method"):  # one's own are in no stored help
+            base = importlib.import_module("mvitac.datasets.base" if option == "--data" else "mvitac.methods.base")
+            choices = [*(base.DatasetConfig if option == "--data" else base.MethodConfig).choices]
+        if value not in choices:
             raise unknown({"--data": "dataset"}.get(option, option[2:]), value, choices)
 
 

@@ -81,7 +81,10 @@ class LeRobotConfig(RecordedConfig):
         """Return the table rows as text, the references of ``embedded`` images, and a note if rows are lacking."""
         tasks, rows, cells = _tasks(self.path, info), list[Row](), Refs()
         for file in sorted((self.path / "data").glob("*/*.parquet")):
+            num = len(rows)
             add_file(file, rows, cells, self.vectors(), embedded)
+            for name in sorted(rows[0].keys() - rows[num].keys() if rows[num:] else ()):
+                raise ValueError(f"{file} has no column {name!r}: fetch the whole dataset")
         for name in ("timestamp", "episode_index", "frame_index", *embedded):
             if name not in ({**rows[0], **cells} if rows else {}):
                 raise ValueError(f"{self.path / 'data'} has no column {name!r}: fetch the whole dataset")

@@ -25,7 +25,7 @@ from mvitac.datasets.table.image_refs import ImageRef
 from mvitac.datasets.table.manifest import Manifest, Row, text_of
 from mvitac.datasets.table.table import RecordedConfig
 from mvitac.registry import unknown
-from mvitac.system.files import brief
+from mvitac.system.files import brief, check_ordinary
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,12 +105,16 @@ def _opened(bag: Path) -> Iterator[Any]:
         from rosbags.typesys import Stores, get_typestore
     except ModuleNotFoundError:
         raise ValueError(f"{bag} needs rosbags: pip install 'mvitac[rosbags]'") from None
+    for file in [bag] if bag.is_file() else bag.rglob("*"):
+        check_ordinary(file)  # a pipe never ends
+        if file.suffix == ".db3" and file.stat().st_size % 512:  # less than its least page: sqlite would read zeros
+            raise ValueError(f"{file} is cut off: fetch it again")
     try:
         with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             yield reader
-    except (ValueError, OSError):
-        raise
     except Exception as error:  # rosbags and what it reads with have no common base class
+        if isinstance(error, ValueError | OSError) and not isinstance(error, UnicodeError):
+            raise
         raise ValueError(f"{bag} cannot be read as a bag ({brief(error)}): is it complete?") from None
 
 

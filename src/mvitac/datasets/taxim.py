@@ -41,6 +41,9 @@ class TaximConfig(PressConfig):
     """Number of simulated presses of the same ball. 0 = the real frames, of --makes or of both gels."""
 
     def source(self) -> Source:
+        for name in ("sensors", "seed", "held_out_sensor") * (not self.num):
+            if getattr(self, name) != getattr(TaximConfig, name):
+                raise ValueError(f"{name} is of simulated presses: give num, too")
         if not self.num and (others := {*self.makes} - {*MEASURED}):
             raise ValueError(f"{', '.join(sorted(others))}: real frames are of {' and '.join(MEASURED)}; else give num")
         (self if self.num else replace(self, makes=tuple(MEASURED))).check_installed()

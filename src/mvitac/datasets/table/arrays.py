@@ -22,6 +22,7 @@ import numpy as np
 from mvitac.data.images import MAX_PIXELS
 from mvitac.datasets.table.image_refs import ArrayRow, ImageRef, entry, open_arrays
 from mvitac.datasets.table.manifest import Manifest, text_of
+from mvitac.system.files import check_ordinary
 
 USUAL = ("vision", "touch", "left", "right", "background")
 """Names of image datasets that are found without being asked for."""
@@ -50,8 +51,10 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
     notes: dict[str, None] = {}
     seen = ""
     for file in files:
-        for link in filter(Path.is_symlink, file.rglob("*")):
-            raise ValueError(f"{link} is a link: copy what it shows into {file}")
+        for inner in file.rglob("*"):
+            if inner.is_symlink():
+                raise ValueError(f"{inner} is a link: copy what it shows into {file}")
+            check_ordinary(inner)  # a pipe never ends
         with open_arrays(file) as opened:
             everything = _datasets(opened)
             demos = _demonstrations(file, everything, images)

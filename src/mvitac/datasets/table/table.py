@@ -252,8 +252,8 @@ class Rows(Source):
     def _check_used(self, table: Manifest) -> None:
         config, listed = self._config, table.path.suffix.lower() in READERS
         idle: dict[str, Any] = {"pictures": listed and "the table names its images"}
-        alone = listed and not config.log and "--data.log names no other clock"
-        idle |= dict.fromkeys(("tolerance", "interpolate"), alone)
+        alone = not config.log and "--data.log names no other clock"
+        idle |= {"tolerance": listed and alone, "interpolate": alone}
         given = self._split != BY_GROUP and f"column {self._split!r} says the split"
         idle |= dict.fromkeys(("test_share", "val_share", "split_seed"), given)
         for name, why in idle.items():
@@ -311,7 +311,7 @@ class Rows(Source):
                 splits.check_leak(where, column, what, names, found)
             for names in filter(None, (self._images[: bool(self._vision)], self._touch)):  # left here, right there
                 there = [(ref, at) for name in names for ref, at in zip(table.images[name], found, strict=True) if ref]
-                images = [os.path.normpath(str(ref)) for ref, _ in there]
+                images = [os.path.realpath(str(ref)) for ref, _ in there]
                 splits.check_leak(where, column, f"{' and '.join(names)} images", images, [side for _, side in there])
         splits.check_sides(where, column, found, tasks, labels, len(set(groups)))
         return found
