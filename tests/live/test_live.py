@@ -319,7 +319,8 @@ def test_a_camera_is_asked_for_a_mode(monkeypatch: pytest.MonkeyPatch) -> None:
 def heard(rig: type[Rig], clock: Clock) -> list[Event]:
     """What is said of a sensor that breaks and comes back."""
     sensor, said = rig(clock, 0), []
-    sensor.stream = stream = Stream("touch", sensor, clock=clock, tell=said.append)
+    sensor.stream = stream = Stream("touch", sensor, clock=clock)
+    stream.tell = said.append
     for sensor.fault in ("", "unplugged", ""):
         clock.now += 2
         stream.pump()

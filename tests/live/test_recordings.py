@@ -188,10 +188,11 @@ def test_a_crop_is_what_the_model_sees(engine: Engine, films: dict[str, Path], t
     free, tables = [next(iter(frames(films["touch"], [0])))[1]], []
     for text, background in ((f"{films['touch']}#40:30:80:60", free), (f"{folder}@25", [free[0][part]])):
         files = {"vision": [recording(str(films["vision"]))], "touch": [recording(text)]}
-        tables.append(whole(Recordings(engine, files, free=background).tables()))
+        tables.append(whole(Recordings(engine, files, LiveConfig(), background).tables()))
     assert all(np.array_equal(values, tables[1][name]) for name, values in tables[0].items())
     assert tables[0]["contact"].sum() == NUM - FREE
-    large = Recordings(engine, {**opened(films), "touch": [recording(f"{films['touch']}#100:0:80:60")]}, free=free[:0])
+    beyond = {**opened(films), "touch": [recording(f"{films['touch']}#100:0:80:60")]}
+    large = Recordings(engine, beyond, LiveConfig())
     assert not list(large.tables()) and "crop 100:0:80:60 reaches beyond 160 x 120" in next(iter(large.told))
 
 

@@ -50,7 +50,8 @@ def test_views_are_rounded_to_bf16_once(route: Callable[..., torch.Tensor]) -> N
 def test_the_plain_view_is_the_normalised_image_and_a_flip_is_exact() -> None:
     raw, every = images(4, side=32), torch.ones(4, dtype=torch.bool)
     torch.testing.assert_close(denormalise(plain_view(raw, 32)), raw.float() / 255, atol=1e-6, rtol=0)
-    view = random_views.apply(raw, Drawn(torch.tensor([[0, 0, 32, 32]] * 4), every, ~every, torch.ones(4, 5)), 32)
+    turned = Drawn(torch.tensor([[0, 0, 32, 32]] * 4), every, ~every, torch.ones(4, 5))
+    view = random_views.apply(raw, turned, 32, torch.float32)
     torch.testing.assert_close(denormalise(view), raw.flip(-1).float() / 255, atol=1e-6, rtol=0)
 
 
@@ -67,12 +68,12 @@ def test_statistics_of_the_paper() -> None:
 
 
 def test_grayscale_makes_channels_equal_before_normalisation() -> None:
-    view = denormalise(apply(images(), draw(ViewAugment(grayscale=1.0), 8, 40, generator()), 24))
+    view = denormalise(apply(images(), draw(ViewAugment(grayscale=1.0), 8, 40, generator()), 24, torch.float32))
     torch.testing.assert_close(view[:, 0], view[:, 1], atol=1e-5, rtol=0)
     torch.testing.assert_close(view[:, 0], view[:, 2], atol=1e-5, rtol=0)
 
 
 def test_stacked_sensors_move_together() -> None:
     raw = images()
-    together = apply(torch.cat([raw, raw], dim=1), draw(ViewAugment(jitter=0.3), 8, 40, generator()), 24)
+    together = apply(torch.cat([raw, raw], dim=1), draw(ViewAugment(jitter=0.3), 8, 40, generator()), 24, torch.float32)
     assert torch.equal(together[:, :3], together[:, 3:])

@@ -25,6 +25,8 @@ from mvitac.system.files import check_place, digest, fields_of
 from mvitac.system.locks import hold_lock
 from mvitac.system.provenance import provenance
 
+Score = Callable[[Sequence[Model], dict[str, Any]], dict[str, Any]]
+
 
 @dataclass(frozen=True, kw_only=True)
 class About:
@@ -62,12 +64,7 @@ def run_bench(places: Sequence[str], suite: Suite, out: Path, root: Path | None,
 
 
 def measure(
-    places: Sequence[str],
-    suite: Any,
-    out: Path,
-    about: About,
-    score: Callable[[Sequence[Model], dict[str, Any]], dict[str, Any]],
-    form: tuple[str, int] = FORM,
+    places: Sequence[str], suite: Any, out: Path, about: About, score: Score, form: tuple[str, int] = FORM
 ) -> Path:
     """Load an encoder (its seeds), let ``score`` measure it, and write <out>/<suite>-<name>.json.
 

@@ -38,6 +38,7 @@ from mvitac.system.files import brief
 from mvitac.system.progress import work
 
 Policy = Callable[[dict[str, Any]], Any]
+Watch = Callable[[Any, dict[str, Any]], None]
 LAG = 10
 PLAUSIBLE = ("another episode", f"{LAG} frames ago")  # what a policy may have met: others may just surprise it
 KINDS = ("mean frame", *PLAUSIBLE, "noise")
@@ -182,11 +183,7 @@ def lerobot_policy(folder: Path) -> Policy:
 
 
 def act(
-    policy: Policy | None,
-    episodes: Episodes,
-    sense: str = "",
-    kind: str = "",
-    watch: Callable[[Any, dict[str, Any]], None] | None = None,
+    policy: Policy | None, episodes: Episodes, sense: str = "", kind: str = "", watch: Watch | None = None
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Actions [N, T] of every step with ``sense`` replaced by ``kind``, what its episode lost [N], steps of each episode.
 

@@ -52,7 +52,7 @@ def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
 def _tables(result: dict[str, Any], lines: Sequence[Line]) -> Iterator[tuple[str, list[str], list[list[str]]]]:
     """Task, heads and rows: of the table of all tasks (named ""), then of the targets of each task with values."""
     reference = plan_of(result).reference
-    yield "", *_table(lines, reference, _any_printed(lines))
+    yield "", *_table(lines, reference, _any_printed(lines), targets=False)
     for task, each in target_lines(result).items():
         yield task, *_table(each, reference, False, targets=True)
 
@@ -61,9 +61,7 @@ def _any_printed(lines: Sequence[Line]) -> bool:
     return any(cell["printed"] is not None for line in lines for cell in line.cells.values())
 
 
-def _table(
-    lines: Sequence[Line], reference: str, shown: bool, *, targets: bool = False
-) -> tuple[list[str], list[list[str]]]:
+def _table(lines: Sequence[Line], reference: str, shown: bool, *, targets: bool) -> tuple[list[str], list[list[str]]]:
     """Heads and rows of a table of ``lines``, with the paper's numbers if ``shown``, and the error of ``targets``."""
     heads, rows = ["", "modality"], []
     for line in lines:

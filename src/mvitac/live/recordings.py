@@ -87,11 +87,7 @@ class Recordings:
     """
 
     def __init__(
-        self,
-        engine: Engine,
-        files: dict[str, list[Recording]],
-        config: LiveConfig = LiveConfig(),
-        free: Sequence[np.ndarray] = (),
+        self, engine: Engine, files: dict[str, list[Recording]], config: LiveConfig, free: Sequence[np.ndarray] = ()
     ) -> None:
         """As for ``Live``; ValueError if the engine takes others or needs a sensor without contact that is not seen."""
         self.engine, self.left_out, self.told = engine, 0, dict[str, int]()

@@ -43,16 +43,11 @@ class Stream:
     """The newest frame of one source, and its faults. Call ``pump`` from one thread only, the rest from any."""
 
     def __init__(
-        self,
-        name: str,
-        origin: Source,
-        *,
-        clock: Callable[[], float] = time.monotonic,
-        tell: Callable[[Event], None] = lambda event: None,
-        stale_after: float = 0.5,
+        self, name: str, origin: Source, *, clock: Callable[[], float] = time.monotonic, stale_after: float = 0.5
     ) -> None:
-        """``tell`` gets every event, in the thread that noticed it. Frames are used for ``stale_after`` seconds."""
-        self.name, self.origin, self.clock, self.tell = name, origin, clock, tell
+        """Frames are used for ``stale_after`` seconds. ``tell`` gets every event, in the thread that noticed it."""
+        self.name, self.origin, self.clock = name, origin, clock
+        self.tell: Callable[[Event], None] = lambda event: None
         self.stale_after, self.ended, self.fault = stale_after, False, ""
         self.num_frames = self.num_dropped = self.num_damaged = 0
         self._side, self._keep = 0, 0.0

@@ -34,9 +34,7 @@ Rng = np.random.Generator
 _TAG = 0x6E1
 
 
-def pressure(
-    relief_mm: F, *, force_n: float, stiffness: float, pixel_mm: float, dome_radius_mm: float | None = 25.0
-) -> F:
+def pressure(relief_mm: F, *, force_n: float, stiffness: float, pixel_mm: float, dome_radius_mm: float | None) -> F:
     """Press an object into the gel: the contact pressure [H, W] in N/mm^2 whose integral over the picture is `force_n`.
 
     Object and gel are springs in series at every pixel, so the contact of a soft object is wider, shallower and flatter.

@@ -120,11 +120,7 @@ def draw(config: ViewAugment, num: int, size: int, generator: torch.Generator) -
 
 
 def apply(
-    images: UInt8[Tensor, "B C H W"],
-    drawn: Drawn,
-    size: int,
-    dtype: torch.dtype = torch.float32,
-    mean_std: MeanStd = IMAGENET,
+    images: UInt8[Tensor, "B C H W"], drawn: Drawn, size: int, dtype: torch.dtype, mean_std: MeanStd = IMAGENET
 ) -> Float[Tensor, "B C S S"]:
     """Apply the parameters ``drawn``: crop to [size, size], flip, colour, normalise. Returns channels-last on their device.
 
@@ -229,7 +225,7 @@ def plain_view(images: UInt8[Tensor, "B C H W"], size: int, mean_std: MeanStd = 
     num, _, height, width = images.shape
     whole = torch.tensor([[0, 0, height, width]]).expand(num, 4)
     never = torch.zeros(num, dtype=torch.bool)
-    return apply(images, Drawn(whole, never, never, torch.ones(num, 5)), size, mean_std=mean_std)
+    return apply(images, Drawn(whole, never, never, torch.ones(num, 5)), size, torch.float32, mean_std)
 
 
 def normalise(images: Float[Tensor, "B C H W"], mean_std: MeanStd = IMAGENET) -> Float[Tensor, "B C H W"]:

@@ -82,9 +82,7 @@ class Residuals:
         found = self.sharp[rows] - self.backgrounds[sensor]
         return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-6)
 
-    def nearest(
-        self, asked: np.ndarray, bank: np.ndarray, apart: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def nearest(self, asked: np.ndarray, bank: np.ndarray, apart: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Return each asked row's nearest of ``bank``, and their correlation.
 
         With ``apart``, among other values of it and of the row's own sensor: what another pack holds may be copies.
@@ -120,7 +118,7 @@ def _near_pairs(
 
     Exact copies are left out. Also returns how common near-duplicates are between groups of ``bank``.
     """
-    best, value = residuals.nearest(asked, bank)
+    best, value = residuals.nearest(asked, bank, apart=None)
     _, natural = residuals.nearest(_some(bank, 500), bank, apart=groups)
     near = float(np.clip((1 + natural.max()) / 2, NEAR_AT_LEAST, NEAR)) if natural.max() > -1 else NEAR
     hit = (value >= near) & (exact[asked] != exact[best])
