@@ -164,9 +164,8 @@ class Run:
                 raise ValueError(f"{what}: give --data.num-frames 2 or more, or leave it out")
             taken = self.init and modality in (self.init.modalities or spec.modalities)
             if encoder.locked and encoder.weights == SCRATCH and not taken:
-                raise ValueError(
-                    f"{modality} is locked at random weights: give --encoder.{modality}.weights, or --init"
-                )
+                how = f"give --encoder.{modality}.weights, or --init"
+                raise ValueError(f"{modality} is locked at random weights: {how}")
             if self.method.needs_vit:
                 check_vit(encoder, self.method.name, size)
         if self.precision == "bf16" and self.device.startswith("mps"):

@@ -120,9 +120,7 @@ def _problems(value: dict[str, Any], suite: Suite) -> Iterator[str]:
                 yield f"{who}, {cell['task']}, {cell['condition']}: no episodes give these sums"
     told: dict[Any, Any] = {}
     free = suite.true, suite.blind  # which do not see what differs between conditions
-    nothing = {
-        c["task"]: c[suite.sums[0]] for row in value["rows"] if row["source"] == suite.blind for c in row["cells"]
-    }
+    nothing = {c["task"]: c[suite.sums[0]] for r in value["rows"] if r["source"] == suite.blind for c in r["cells"]}
     for row in sorted(value["rows"], key=lambda row: row["source"] not in free):
         for cell in row["cells"]:
             who = f"{row['source'] or 'the encoder'}, seed {row['seed']}, {cell['task']}, {cell['condition']}"

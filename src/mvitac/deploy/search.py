@@ -68,9 +68,7 @@ class Embeddings:
             assert not any(np.isinf(x).any() for x in given.values()), "infinite numbers"
             for task, names in self.classes.items():
                 labels = self.table.column(f"label_{task}").to_pylist()
-                assert {*map(type, labels)} == {int} and -1 <= min(labels) <= max(labels) < len(names), (
-                    f"labels of {task}"
-                )
+                assert {*map(type, labels)} == {int} and {*labels} <= {*range(-1, len(names))}, f"labels of {task}"
             own = self.table.select(["id", "group", "row"]).to_pydict()
             assert {*map(type, own["row"])} == {int}, "numbers of rows"
             assert not CONTROL.search(json.dumps([own["id"], own["group"]])), "a control character"
@@ -79,14 +77,7 @@ class Embeddings:
                 raise ValueError(f"{file} was embedded by another model: embed the pack again")
 
     def find(
-        self,
-        model: Model,
-        images: ImageInput,
-        source: str,
-        target: str,
-        k: int = 5,
-        *,
-        background: ImageInput | None = None,
+        self, model: Model, images: ImageInput, source: str, target: str, k: int, background: ImageInput | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """The ``k`` nearest images of modality ``target`` to ``images`` of modality ``source``.
 

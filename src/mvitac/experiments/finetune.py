@@ -103,10 +103,8 @@ def finetune(
     pack = data.open(quiet=quiet)
     model, init = _start(ancestor, data, pack)
     swapped = {*asked.labels} & {v.name for v in pack.spec.values} | {*asked.values} & {t.name for t in pack.spec.tasks}
-    if swapped:
-        raise ValueError(
-            f"{', '.join(sorted(swapped))}: --labels is for tasks with classes, --values for those with values"
-        )
+    if both := ", ".join(sorted(swapped)):
+        raise ValueError(f"{both}: --labels is for tasks with classes, --values for those with values")
     names = (*asked.labels, *asked.values) or tuple(task.name for task in pack.spec.tasks or pack.spec.values)
     tasks = tuple(chosen(pack, ProbeConfig(tasks=names))[0])
     fitted = fitting(model, pack, asked.modalities or MODALITIES)

@@ -271,13 +271,9 @@ class Head(nn.Sequential):
     """Projection head g(.; phi): a 2-layer MLP with ReLU after the first layer only (paper, appendix A)."""
 
     def __init__(self, features: int, hidden: int, out: int, *, dropout: float = 0.0, norm: bool = False) -> None:
-        layers: list[nn.Module] = [nn.Linear(features, hidden, bias=not norm)]
-        if norm:
-            layers.append(nn.BatchNorm1d(hidden))
-        layers.append(nn.ReLU())
-        if dropout:
-            layers.append(nn.Dropout(dropout))
-        super().__init__(*layers, nn.Linear(hidden, out))
+        norms, drops = [nn.BatchNorm1d(hidden)] * norm, [nn.Dropout(dropout)] * bool(dropout)
+        first = nn.Linear(features, hidden, bias=not norm)
+        super().__init__(first, *norms, nn.ReLU(), *drops, nn.Linear(hidden, out))
 
 
 class Projected(nn.Module):

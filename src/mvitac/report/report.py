@@ -38,7 +38,6 @@ def write_report(
     is complete (``stored_result``), else they are probed here, with logistic regression, all tasks and all controls.
     ``pack`` is shown instead of the runs' own. ValueError if a run is unfinished, or ``result`` is about others.
     """
-    paths = [Path(path) for path in paths]
     runs = open_runs(paths)
     if pack is None and len({r.record.get("pack") for r in runs}) > 1:
         raise ValueError("these runs were trained on different data: write one report per dataset")

@@ -117,9 +117,7 @@ class TouchAndGo(Source):
             "reader": f"touch-and-go {VERSION}",
             "lists": {name: digest_file(self._lists / name) for name in sorted(lists.LIST_FILES)},
             "options": {k: v for k, v in to_json(config).items() if k not in ("root", "lists", *KEEPING)},
-            "recordings": digest(
-                [[name, *(place.name for place in places.values())] for name, places in found.items()]
-            ),
+            "recordings": digest([[name, *(p.name for p in places.values())] for name, places in found.items()]),
             "missing": dict(sorted(missing.items())),
         }
 
