@@ -357,12 +357,8 @@ def test_files(
     assert not (tmp_path / "exploded").exists()
 
 
-PLACES = {
-    "{tmp}/file/below": "Not a directory",
-    "{tmp}/" + "n" * 300: "too long",
-    "/proc/mvitac-out": "/proc/mvitac-out",
-    "{tmp}/mine": "{tmp}/mine",
-}
+PLACES = {"{tmp}/file/below": "Not a directory", "{tmp}/" + "n" * 300: "too long"}
+PLACES |= {"/proc/mvitac-out": "/proc/mvitac-out", "{tmp}/mine": "{tmp}/mine"}
 
 
 @pytest.mark.parametrize("command", [PRETRAIN, "probe {run} --json {out}"])
@@ -377,13 +373,11 @@ def test_a_place_nothing_can_be_written_to(
     refused(command.replace("{out}", out), says)
 
 
-def test_contact_in_a_pack(refused: Callable[..., str], pack: Pack, tmp_path: Path) -> None:
+def test_contact_in_a_pack(refused: Callable[..., str], tmp_path: Path) -> None:
     for option in ("--contact 3", "--calibration 9", "--background x.png"):
         (tmp_path / "x.png").write_bytes(b"")
-        refused(
-            f"predict e {pack.path} {option} --out {{out}}", "--background, --calibration and --contact are for rec"
-        )
-    refused(f"predict e {pack.path} --touch gel --out {{out}}", "--touch is for recordings and tables, /")
+        refused(f"predict e {{pack}} {option} --out {{out}}", "--background, --calibration and --contact are for rec")
+    refused("predict e {pack} --touch gel --out {out}", "--touch is for recordings and tables, /")
 
 
 @pytest.mark.parametrize("command", ["demo --recipe smoke", "pretrain --data folder", "pretrain --data materials"])

@@ -272,12 +272,8 @@ def test_rows(small: Servo) -> None:
 
 def test_the_suite_shows_what_was_measured() -> None:
     """Mean levels: another processor rounds a pixel otherwise, another scene does not come near."""
-    levels = {
-        "straight": [87.89, 103.34],
-        "curved": [86.86, 102.87],
-        "corner": [104.79, 107.80],
-        "surface": [133.27, 112.03],
-    }
+    levels = {"straight": [87.89, 103.34], "curved": [86.86, 102.87]}
+    levels |= {"corner": [104.79, 107.80], "surface": [133.27, 112.03]}
     for kind in KINDS:
         seen = [begin(kind, 0, name).look("touch").mean() for name in ("known sensor", "new sensor")]
         assert seen == pytest.approx(levels[kind], abs=0.05)

@@ -113,10 +113,8 @@ def test_frames_are_upright(made: dict[str, Path], tmp_path: Path) -> None:
     """The header says that players turn a quarter clockwise, as a telephone's do."""
     path, one = write_video(tmp_path / "a.mp4", 1, lambda i: numbered(i, "touch")), (1 << 16).to_bytes(4, "big")
     ((_, plain),) = frames(path, [0])
-    matrix, turned = (
-        one + bytes(12) + one,
-        bytes(4) + one + bytes(4) + (-1 << 16).to_bytes(4, "big", signed=True) + bytes(4),
-    )
+    matrix = one + bytes(12) + one
+    turned = bytes(4) + one + bytes(4) + (-1 << 16).to_bytes(4, "big", signed=True) + bytes(4)
     whole = path.read_bytes()
     at = whole.index(matrix, whole.index(b"tkhd"))
     ((_, upright),) = frames(copy_with(path, tmp_path / "b.mp4", at, turned), [0])
@@ -210,9 +208,8 @@ def test_frames_that_are_not_there(made: dict[str, Path]) -> None:
 
 
 def test_files_that_are_no_videos(made: dict[str, Path], tmp_path: Path) -> None:
-    (tmp_path / "cut.mkv").write_bytes(
-        write_video(tmp_path / "v.mkv", 2, lambda i: numbered(i, "touch")).read_bytes()[:700]
-    )
+    short = write_video(tmp_path / "v.mkv", 2, lambda i: numbered(i, "touch"))
+    (tmp_path / "cut.mkv").write_bytes(short.read_bytes()[:700])
     with pytest.raises(ValueError, match=r"cut\.mkv holds no frames: it is damaged or cut off"):
         video.frame_times(tmp_path / "cut.mkv")
     whole = made["mpeg4"].read_bytes()  # half of it lacks its table

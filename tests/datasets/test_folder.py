@@ -274,11 +274,8 @@ def test_sixteen_bits_are_scaled_not_clipped(tmp_path: Path) -> None:
     Image.fromarray(np.zeros((9, 9, 3), np.uint8)).save(tmp_path / "rgb.png")
     with pytest.raises(ValueError, match="read as RGB of 8 bits"):
         decode(tmp_path / "rgb.png", span=(0, 2040))
-    parts = (
-        (b"IHDR", struct.pack(">IIBBBBB", 2, 2, 16, 2, 0, 0, 0)),
-        (b"IDAT", zlib.compress(bytes(26))),
-        (b"IEND", b""),
-    )
+    head = struct.pack(">IIBBBBB", 2, 2, 16, 2, 0, 0, 0)
+    parts = (b"IHDR", head), (b"IDAT", zlib.compress(bytes(26))), (b"IEND", b"")
     chunks = (struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in parts)
     (tmp_path / "deep.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
     with pytest.raises(ValueError, match="16 bits a colour"):
@@ -494,13 +491,10 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
     for suffix in ("csv", "jsonl"):
         write(rows, tmp_path / f"manifest.{suffix}")
     latin = [f"touch/{label}/{i}.png" for label in ("a", "b\udcff") for i in range(9)]  # a name that is not UTF-8
+    lonely = r"row 2 \(touch/b/1\.png\) has no vision path: .*allow-missing"
     for folder, names, says in (
         ("", [], "manifest.csv and manifest.jsonl"),
-        (
-            "lonely",
-            ["vision/a/1.png", "touch/b/1.png"],
-            r"row 2 \(touch/b/1\.png\) has no vision path: .*allow-missing",
-        ),
+        ("lonely", ["vision/a/1.png", "touch/b/1.png"], lonely),
         ("half flat", ["touch/1.png", "touch/a/2.png"], r"1\.\* is not in a class folder"),
         ("twins", ["touch/a/1.png", "touch/a/1.bmp"], "differ in their suffix only"),
         ("beside", ["train/a/1.png", "test/b/2.png", "validation/a/3.png"], "images in validation beside train, test:"),

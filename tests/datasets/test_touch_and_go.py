@@ -18,16 +18,8 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.video import frames
 from mvitac.datasets.table.splits import stratify
-from mvitac.datasets.touch_and_go.lists import (
-    CLASSES,
-    SOFT,
-    assign_by_recording,
-    assign_official,
-    find_touches,
-    leaks,
-    read_list,
-    read_lists,
-)
+from mvitac.datasets.touch_and_go import lists
+from mvitac.datasets.touch_and_go.lists import CLASSES, SOFT, assign_by_recording, find_touches, read_list, read_lists
 from mvitac.datasets.touch_and_go.reader import TouchAndGoConfig, _columns, _spec
 from mvitac.evaluation.leaks import Scored, source_of
 from mvitac.evaluation.probe import split_rows
@@ -94,12 +86,8 @@ def test_the_published_lists_parse_to_the_published_counts() -> None:
         rows = read_list(LISTS / f"{name}.txt", num_classes)
         counts[name] = (len(rows), len({recording for recording, _, _ in rows}))
         assert min(label for _, _, label in rows) >= 0
-    assert counts == {
-        "train": (91_982, 120),
-        "test": (29_879, 106),
-        "train_rough": (35_119, 19),
-        "test_rough": (8_085, 4),
-    }
+    rough = {"train_rough": (35_119, 19), "test_rough": (8_085, 4)}
+    assert counts == {"train": (91_982, 120), "test": (29_879, 106), **rough}
     test = Counter(label for _, _, label in read_list(LISTS / "test.txt", 20))
     assert round(1 - sum(test[label] for label in SOFT) / test.total(), 3) == 0.680  # hard
     assert round(max(test.values()) / test.total(), 3) == 0.240 and 10 not in test
@@ -110,7 +98,7 @@ def test_frames_that_only_the_rough_lists_name_are_hidden_from_all_else() -> Non
     """Retrieval has the owners' 29,879 test rows, not 50,614, and the supervised rough has the labels of its probe."""
     listed = read_lists(LISTS)
     find_touches(listed)
-    assign_official(listed, 0, 0)
+    lists.assign_official(listed, 0, 0)
     pack = object.__new__(Pack)  # the table alone
     pack.spec = _spec(TouchAndGoConfig(split="official"), True, (), False)
     pack.table, pack.num = pa.Table.from_pylist([_columns(frame, pack.spec) for frame in listed]), len(listed)
@@ -130,10 +118,8 @@ def test_frames_that_only_the_rough_lists_name_are_hidden_from_all_else() -> Non
     kept = ["id", "group", "split", "split_rough", "label_category", "label_soft", "label_rough"]
     pack.table = pack.table.select(kept)
     source, scored = source_of(pack, pack.rows("train")), Scored(pack)
-    assert scored.leak([source], test) == (
-        f"0 of 29879 test rows and 100 of {len(set(groups[test]))} test recordings were trained on"
-        " (touch-and-go (official))"
-    )
+    says = f"0 of 29879 test rows and 100 of {len(set(groups[test]))} test recordings were trained on"
+    assert scored.leak([source], test) == f"{says} (touch-and-go (official))"
 
 
 @published
@@ -141,7 +127,7 @@ def test_the_published_lists_make_one_index_and_its_leaks_are_said() -> None:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # of the tests before it
     listed = read_lists(LISTS)
     assert len(listed) == 142_596 and len({frame.recording for frame in listed}) == 126
-    assert leaks(listed) == [
+    assert lists.leaks(listed) == [
         "official split: 100 of 106 test recordings are also in train (other touches)",
         "official split: 3289 of 8085 rough/smooth test frames are in the pre-training list",
     ]

@@ -72,10 +72,8 @@ def test_find_command_draws_what_it_found(
     table, other = pq.read_table(known), tmp_path / "other.parquet"
     turned = table.set_column(table.column_names.index("row"), "row", pa.array(range(table.num_rows)[::-1]))
     pq.write_table(turned, other)
-    assert (
-        main([str(other) if word == str(known) else word for word in [*command, "--sheet", str(tmp_path / "x.png")]])
-        == 2
-    )
+    words = [str(other) if word == str(known) else word for word in command]
+    assert main([*words, "--sheet", str(tmp_path / "x.png")]) == 2
     assert "other.parquet: its ids are not those of its rows in" in capsys.readouterr().err
     assert main(["find", *[str(tmp_path / "q.png")] * 2, *of]) == 2
     assert "looks at 1 images of touch: 2 are given" in capsys.readouterr().err
@@ -115,9 +113,8 @@ def test_vectors_that_another_program_changed_are_refused(known: Path, tmp_path:
     for name, cell in (("label_pattern", 9), ("label_pattern", None), ("row", 0.5), ("id", "\x1b[31m")):
         cells = [cell, *table.column(name).to_pylist()[1:]]
         pq.write_table(table.set_column(table.column_names.index(name), name, pa.array(cells)), file)
-        with pytest.raises(
-            ValueError, match=r"other\.parquet is damaged: .*(labels of pattern|numbers of rows|control char)"
-        ):
+        says = r"other\.parquet is damaged: .*(labels of pattern|numbers of rows|control char)"
+        with pytest.raises(ValueError, match=says):
             Embeddings(file, model.weights_digest())
     pq.write_table(table.replace_schema_metadata({"mvitac-embeddings": ""}), file)
     with pytest.raises(ValueError, match=r"other\.parquet is no table of mvitac embed"):

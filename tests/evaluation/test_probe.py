@@ -21,15 +21,7 @@ from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation import controls
 from mvitac.evaluation import features as features_module
 from mvitac.evaluation.classifiers import fit_knn, fit_linear, fit_papers
-from mvitac.evaluation.controls import (
-    borders,
-    controls_of,
-    frozen_trunks,
-    imagenet_trunk,
-    label_controls,
-    starts_of,
-    thumbnails,
-)
+from mvitac.evaluation.controls import controls_of, frozen_trunks, imagenet_trunk, label_controls, starts_of
 from mvitac.evaluation.diagnostics import linear_probe
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import _folded
@@ -84,7 +76,8 @@ def test_the_papers_probe_learns_and_repeats() -> None:
     assert np.array_equal(first, same) and not np.array_equal(first, other)
 
 
-def test_linear_equals_scikit_learn(pack: Pack) -> None:
+def test_linear_equals_scikit_learn_and_nothing_is_chosen_on_test(pack: Pack) -> None:
+    """Shuffling the test labels changes the score but not the regularisation nor the predictions."""
     task = pack.spec.tasks[0]
     rows, x = split_rows(pack, task), features_that_know(pack, how_well=0.4)
     found = probe_features(x, pack, task, rows, "linear", 0)[0]
@@ -95,18 +88,10 @@ def test_linear_equals_scikit_learn(pack: Pack) -> None:
     model.fit((x[:num_both] - mean) / std, labels[np.concatenate([rows.train, rows.val])])
     expected = model.score((x[num_both:] - mean) / std, labels[rows.test])
     assert found["accuracy"] == pytest.approx(expected, abs=1.5 / found["num_test"])  # solvers stop at different digits
-
-
-def test_nothing_is_chosen_on_test(pack: Pack) -> None:
-    """Shuffling the test labels changes the score but not the regularisation nor the predictions."""
-    task = pack.spec.tasks[0]
-    rows, x = split_rows(pack, task), features_that_know(pack, how_well=0.6)
-    before = probe_features(x, pack, task, rows, "linear", 0)[0]
-    labels = pack.column("label_pattern").copy()
     labels[rows.test] = (labels[rows.test] + 1) % 3
     after = probe_features(x, with_columns(pack, label_pattern=labels), task, rows, "linear", 0)[0]
-    assert after["C"] == before["C"]
-    assert np.array_equal(np.roll(before["confusion"], 1, axis=0), after["confusion"])
+    assert after["C"] == found["C"]
+    assert np.array_equal(np.roll(found["confusion"], 1, axis=0), after["confusion"])
 
 
 def test_val_is_carved_from_train_by_group_if_there_is_none(pack: Pack) -> None:
@@ -367,14 +352,14 @@ def test_a_thumbnail_is_the_mean_of_its_pixels_and_the_border_sees_nothing_of_th
         return SimpleNamespace(images={"touch": np.stack(images)})
 
     image = np.random.default_rng(0).integers(0, 255, (32, 32, 6), np.uint8)
-    found = thumbnails(pictures(image), "touch", np.array([0]), side=8)
+    found = controls.thumbnails(pictures(image), "touch", np.array([0]), side=8)
     blocks = image.reshape(8, 4, 8, 4, 6).mean((1, 3)) / 255
     assert np.allclose(found[0], blocks.transpose(2, 0, 1).ravel(), atol=1e-6)
     plain = np.full((32, 32, 3), 7, np.uint8)
     middle, edge = plain.copy(), plain.copy()
     middle[4:-4, 4:-4] = 200
     edge[16, 3] = 200
-    found = borders(pictures(plain, middle, edge), "touch", np.arange(3))
+    found = controls.borders(pictures(plain, middle, edge), "touch", np.arange(3))
     assert found.shape == (3, 3 * (16 * 16 - 12 * 12))
     assert np.array_equal(found[0], found[1]) and not np.array_equal(found[0], found[2])
 

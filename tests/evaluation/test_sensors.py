@@ -15,14 +15,7 @@ from mvitac.data.several import JoinedPack, MixedPack
 from mvitac.data.source import Sample
 from mvitac.evaluation import sensors as module
 from mvitac.evaluation.features import features
-from mvitac.evaluation.sensors import (
-    RecolouredPack,
-    about_new,
-    describe_statistics,
-    sensors_of,
-    touch_features,
-    unlabelled_rows,
-)
+from mvitac.evaluation.sensors import RecolouredPack, about_new, sensors_of, touch_features, unlabelled_rows
 from mvitac.model import Model, load
 from mvitac.nn.initial import Init
 from mvitac.run import load_run
@@ -80,7 +73,7 @@ def test_statistics_never_take_test_images_while_there_are_others(others: Pack) 
     assert len(unlabelled_rows(many, 0, 40)) == 40
     few = with_columns(others, sensor=np.where(split == "test", "one", "two"))
     assert set(split[unlabelled_rows(few, 0)]) == {"test"}
-    used = describe_statistics(few, ("features",))
+    used = module.describe_statistics(few, ("features",))
     assert "test images among them" in used[0] and "test" not in used[1]
 
 

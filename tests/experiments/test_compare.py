@@ -85,9 +85,8 @@ def test_table1_has_one_budget_and_ablation_leaves_out_what_changes_nothing(pack
         lay_out(small(pack), with_columns(pack, split=["train"] * pack.num), tmp_path, ProbeConfig())
     with pytest.raises(ValueError, match="batch_size is 999: give --set batch_size=72 or less"):
         lay_out(small(pack, rows=ABLATION.rows, set={"batch_size": 999}), pack, tmp_path, ProbeConfig())
-    own = lay_out(
-        small(pack, rows=(Row(label="MViTac"), Row(label="b", set={"batch_size": 999}))), pack, tmp_path, ProbeConfig()
-    )
+    rows = (Row(label="MViTac"), Row(label="b", set={"batch_size": 999}))
+    own = lay_out(small(pack, rows=rows), pack, tmp_path, ProbeConfig())
     assert own.left_out["b"].endswith("batch_size is 999: give batch_size=72 or less")
 
 
@@ -315,9 +314,8 @@ def test_a_run_that_diverges_is_told_and_the_rest_goes_on(pack: Pack, tmp_path: 
     assert "Diverged: wild, seed 0" in write_tables(result, tmp_path)[0].read_text()
     assert {record["source"] for record in result["records"]} == {"MViTac"}
     lost = replace(work, jobs=[job for job in work.jobs if job.label == "wild"])
-    with pytest.raises(
-        ValueError, match=r"no run of .* is finished with probes linear: .*; wild, seed 0: the loss is not"
-    ):
+    says = r"no run of .* is finished with probes linear: .*; wild, seed 0: the loss is not"
+    with pytest.raises(ValueError, match=says):
         gather(lost, tmp_path, ProbeConfig(controls=False))
 
 

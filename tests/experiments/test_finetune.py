@@ -127,10 +127,8 @@ def test_a_gain_over_few_groups_has_no_interval(capsys: pytest.CaptureFixture[st
 def test_only_a_sure_gain_is_published(num: int, right: int, says: str) -> None:
     """Of 10 rows in each group, the frozen probe has 5 right, and 4 or 6 in some."""
     known: dict[str, Any] = {"task": "kind", "fraction": 100.0, "seed": 0, "group_sizes": [10] * num, "accuracy": 0.5}
-    records = [
-        known | {"source": TUNED, "group_correct": [right] * num},
-        known | {"source": FROZEN, "group_correct": [4 + k % 3 for k in range(num)]},
-    ]
+    each = {TUNED: [right] * num, FROZEN: [4 + k % 3 for k in range(num)]}
+    records = [known | {"source": source, "group_correct": correct} for source, correct in each.items()]
     assert says in next_step({"records": records, "group_by": "object", "models": ["runs/x/seed0"]}, 100.0)
 
 
