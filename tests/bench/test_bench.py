@@ -332,13 +332,9 @@ def other_unit(value: dict[str, Any]) -> None:
         sums["squared_value"] = (np.square(sums["value"]) / np.maximum(sums["n"], 1)).tolist()
 
 
-def own_control(value: dict[str, Any]) -> None:
-    value["suite"]["sets"][0]["forms"][0]["data"] = {"name": "folder", "controls": ["width = w,h"]}
-    value["suite_digest"] = suite_of(value).digest()
-
-
-def own_values(value: dict[str, Any]) -> None:
-    value["suite"]["sets"][0]["forms"][0]["data"] = {"name": "folder", "values": ["light=lumen:lm"]}
+def own_data(data: dict[str, Any], value: dict[str, Any]) -> None:
+    form = value["suite"]["sets"][0]["forms"][0]
+    form |= {"data": data, "at": form["at"] if data["name"] == "folder" else {}}
     value["suite_digest"] = suite_of(value).digest()
 
 
@@ -427,9 +423,16 @@ FORGED: dict[str, tuple[Change, str]] = {
     "leaks by name": (put("blocks", 0, "leaks", value={"a": 1}), "a leak mark, a note, a group or what"),
     "rows in floats": (put(*RECORDS, 0, "sums", "n", 0, value=float), "its sums are no numbers"),
     "no features": (put("encoder", "features", value={}), "its features and parameters are of other senses"),
-    "unit of the suite": (own_values, r"its values are .*, those of the suite \[\['lumen', 'lm'\]\]"),
+    "unit of the suite": (
+        partial(own_data, {"name": "folder", "values": ["light=lumen:lm"]}),
+        r"its values are .*, those of the suite \[\['lumen', 'lm'\]\]",
+    ),
     "errors in another unit": (other_unit, "its errors are not those of one answer"),
-    "control of the data": (own_control, "lacks width, none, linear, None"),
+    "control of the data": (
+        partial(own_data, {"name": "folder", "controls": ["width = w,h"]}),
+        "lacks width, none, linear, None",
+    ),
+    "control of simulated data": (partial(own_data, {"name": "grasps"}), "lacks contact only, none, linear"),
     "note": (put("blocks", 0, "notes", value=[5]), "a leak mark, a note, a group or what groups are is no text"),
     "clipped of what": (put(*VALUES, "clipped", value=[9]), r"it says that \[9\] features were clipped"),
     "features": (put("encoder", "features", "touch", value=-64), "touch is -64"),

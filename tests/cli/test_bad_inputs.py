@@ -128,6 +128,7 @@ WORDS: list[tuple[str, str, str]] = [
     (PRETRAIN, "--bach-size 16", "--batch-size"),
     (PRETRAIN, "--batch-size " + "9" * 5000, "--batch-size"),
     (PRETRAIN, "--batch-size 100", "72 rows"),
+    ("data pack --data taxim --out {out} ", "--held-out-sensor", "held_out_sensor is of simulated presses: give num"),
     (PACKED, "--every 3", "presses.csv: --every is not for tables"),
     (f"probe --encoder {RANDOM} ", "--allow-leak", "--allow-leak is of runs: name one"),
     ("finetune {run} --data pack --out {out} ", "--seeds 0", "seeds 0: give 1 to 1000"),

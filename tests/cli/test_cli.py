@@ -11,10 +11,12 @@ from unittest.mock import Mock
 
 import pytest
 
-from mvitac.cli.main import COMMANDS, HELP, main
+from mvitac.cli.main import COMMANDS, HELP, _check_choices, help_file, main
 from mvitac.cli.pretrain import _chosen_run
 from mvitac.data.pack import Pack
 from mvitac.datasets import DatasetConfig, dataset
+from mvitac.methods.base import MethodConfig
+from mvitac.model import load
 from mvitac.registry import default
 from mvitac.run import Run
 from mvitac.training.loop import Interrupted
@@ -47,6 +49,17 @@ def test_wrong_arguments_are_refused_before_torch_is_imported() -> None:
     assert done.stdout.splitlines() == [f"2 False {command}" for command in WRONG]
     for word in ("nosuch", "mateials", "folds 1", "error: Unrecognized options: --bogus"):
         assert word in done.stderr
+
+
+def test_a_method_of_ones_own_is_known(smoke_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No stored help lists it; and whoever opens its run without it is told so."""
+    monkeypatch.setitem(MethodConfig.choices, "mine", MethodConfig)
+    _check_choices(["--method", "mine"], help_file("pretrain"))
+    with pytest.raises(ValueError, match="unknown method 'mime': choose from"):
+        _check_choices(["--method", "mime"], help_file("pretrain"))
+    monkeypatch.delitem(MethodConfig.choices, "mvitac")
+    with pytest.raises(ValueError, match=r"model.safetensors: unknown method 'mvitac': .* once its module is imported"):
+        load(smoke_run)
 
 
 @pytest.mark.parametrize(

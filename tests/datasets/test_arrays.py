@@ -255,6 +255,10 @@ def test_a_replay_buffer_in_zarr(tmp_path: Path, kind: str) -> None:
         (path / "data" / "gel" / "more").symlink_to(tmp_path)
         with pytest.raises(ValueError, match=r"more is a link: copy what it shows into .*b\.zarr"):
             config.source()
+        (path / "data" / "gel" / "more").unlink()
+        os.mkfifo(path / "data" / "gel" / "more")  # reading it would wait for ever
+        with pytest.raises(ValueError, match="more is neither a file nor a folder"):
+            config.source()
 
 
 @pytest.mark.parametrize("kind", ["zarr", "hdf5", "never written"])

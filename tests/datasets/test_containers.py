@@ -229,6 +229,16 @@ def test_lerobot_refuses_rows_that_contradict_the_description(
         LeRobotConfig(path=root, labels=("kind",)).source()
 
 
+def test_lerobot_names_the_file_that_lacks_a_column(tmp_path: Path) -> None:
+    root = changed(make_lerobot(tmp_path / "set"), lambda row: row)
+    with pytest.raises(ValueError, match="interpolate has no effect, --data"):
+        LeRobotConfig(path=root, labels=("kind",), interpolate="nearest").source()
+    file = next((root / "data").glob("*/*.parquet"))
+    pq.write_table(pq.read_table(file).drop_columns(["task_index"]), file.with_name("file-009.parquet"))
+    with pytest.raises(ValueError, match=r"file-009\.parquet has no column 'task_index': fetch the whole dataset"):
+        LeRobotConfig(path=root, labels=("kind",)).source()
+
+
 def test_lerobot_says_when_there_is_less_than_was_recorded(tmp_path: Path) -> None:
     root = make_lerobot(tmp_path / "set")
     (file := root / "meta/info.json").write_text(json.dumps(json.loads(file.read_text()) | {"total_frames": 30}))

@@ -508,6 +508,11 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
     (tmp_path / "half flat/touch/a/1.png").symlink_to("not fetched")
     with pytest.raises(ValueError, match=r"1 of 2 image files are missing or empty, e.g. row 1 touch touch/a/1\.png"):
         FolderConfig(path=tmp_path / "half flat").source()
+    (tmp_path / "same.csv").write_text("touch,split\na.png,train\nb.png,test\n")
+    picture(tmp_path / "a.png")
+    (tmp_path / "b.png").symlink_to("a.png")
+    with pytest.raises(ValueError, match="1 of 1 touch images are in more than one split"):
+        FolderConfig(path=tmp_path / "same.csv").source()
     (tmp_path / "half flat/touch/b").symlink_to(tmp_path / "lonely")
     with pytest.raises(ValueError, match="touch/b is a link to a folder: put the folder in its place"):
         FolderConfig(path=tmp_path / "half flat").source()

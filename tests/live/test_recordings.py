@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pyarrow.csv
 import pytest
@@ -163,6 +164,14 @@ def test_predict_command(
     said = capsys.readouterr().err
     assert "1 of 2 rows are left out" in said
     assert "touch shows 0:0:16:16, the model learned from whole images" in said
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, data in {
+            **{f"demo/{m}": pack.images[m][:3] for m in pack.images},
+            "lost/force": np.arange(3),
+        }.items():
+            file[f"data/{name}"] = data
+    assert main([*command, str(tmp_path / "a.h5"), "--out", str(out)]) == 0
+    assert "note: a.h5: data/lost is left out: it has no images" in capsys.readouterr().err
     (tmp_path / "gel.csv").write_text("touch\ntouch.png\n")
     (empty := tmp_path / "empty").mkdir()
     wrong = {

@@ -209,9 +209,7 @@ def _copies(records: Sequence[dict[str, Any]]) -> Iterator[str]:
         same = one["modality"] == other["modality"] and one["sums"] == other["sums"] and one["sums"] not in mean
         if same and apart and (fixed or one.get("clipped") != other.get("clipped")):
             yield f"{_who(one)}: has the sums of {_who(other)}"
-    fits: dict[
-        tuple[str, str], list[tuple[Any, bool]]
-    ] = {}  # two probes -> whether each of their fits has the same sums
+    fits: dict[Any, list[tuple[Any, bool]]] = {}  # two probes -> whether each of their fits has the same sums
     for one, other in itertools.combinations([r for r in records if r["sums"] not in mean], 2):
         if one["probe"] != other["probe"] and all(one[key] == other[key] for key in ("source", "modality", "seed")):
             fits.setdefault((one["probe"], other["probe"]), []).append((other, one["sums"] == other["sums"]))

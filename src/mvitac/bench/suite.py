@@ -223,8 +223,7 @@ def _fold(pack: Pack, one: SuiteSet) -> tuple[Pack, ...]:
     if isinstance(first, Task):  # folds have an equal share of groups with each mean label; of values, of all groups
         labels = [own[own >= 0] for own in (pack.labels(first.name)[groups == group] for group in kept)]
         strata = [f"{known.mean():.2f}" if len(known) else "" for known in labels]
-    columns = folds(kept, strata, one.folds, one.val_every)
-    sides = [dict(zip(kept, column, strict=True)) for column in columns.values()]
+    sides = [dict(zip(kept, column, strict=True)) for column in folds(kept, strata, one.folds, one.val_every).values()]
     splits = ([side.get(group, "unlabelled") for group in groups.tolist()] for side in sides)
     return tuple(pack.with_splits({"split": split}) for split in splits)
 

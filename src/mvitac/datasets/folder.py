@@ -9,12 +9,7 @@ Without a table, files are paired by their path inside the modality's folder, wi
     <root>/train/vision/<class>/...             <root>/test/vision/<class>/...           split by folder
     <root>/<class>/<name>.jpg                   one modality (see ``pictures``)
 
-and the cameras of a **recording** by time:
-
-    <root>/<name>.mp4                           one camera (see ``pictures``), each video is a recording and a group
-    <root>/<name>/gel.mp4  camera.mp4           two cameras: ``touch`` gel, ``vision`` camera
-    <root>/touch/<name>.mp4  vision/<name>.mp4  the same by folders; vision, touch, left and right need no option
-    <root>/<number>.jpg                         one recording of one camera; a number of seconds since 1970 is its time
+The cameras of a **recording** are paired by time; both layouts are in docs/datasets.md.
 """
 
 from dataclasses import dataclass

@@ -9,9 +9,6 @@
 
 Version 2 has a file per episode, data/chunk-000/episode_000000.parquet and videos/chunk-000/<camera key>/episode_000000.mp4,
 and meta/tasks.jsonl.
-
-A sample is a pair: both cameras at the time of a table row. From a video, the frame with the nearest presentation time is
-used, so cameras may have different rates. If it is farther away than ``tolerance``, the image is missing.
 """
 
 import os
@@ -70,9 +67,8 @@ class LeRobotConfig(RecordedConfig):
         embedded = [key for key in names.values() if info["features"][key]["dtype"] == "image"]
         episodes = _episodes(self.path, info)
         rows, cells, notes = self._table(info, episodes, embedded)
-        found: Refs = {}
-        for column, key in names.items():
-            found[column] = cells[key] if key in cells else self._in_videos(info, key, rows, episodes)
+        videos = {key: self._in_videos(info, key, rows, episodes) for key in names.values() if key not in cells}
+        found: Refs = {column: {**cells, **videos}[key] for column, key in names.items()}
         return Manifest.of(self.path, rows, found, group="episode", notes=notes)
 
     def _table(
