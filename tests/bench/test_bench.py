@@ -87,7 +87,6 @@ GOLDEN = {
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A --data-root with the striped pairs, with values, and the suite's file."""
     root = tmp_path_factory.mktemp("bench")
     toy_pack(root / "stripes", values=True)
     (root / "toys.toml").write_text(SUITE)

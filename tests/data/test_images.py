@@ -96,7 +96,6 @@ def test_same_pixels_everywhere(kind: str, tmp_path: Path) -> None:
 
 
 def smooth(size: tuple[int, int]) -> Image.Image:
-    """A random RGB picture that JPEG keeps well."""
     return Image.fromarray(np.random.default_rng(5).integers(0, 256, (16, 16, 3), dtype=np.uint8)).resize(size)
 
 

@@ -175,7 +175,6 @@ def test_a_row_that_cannot_be_decoded_is_named(small: Pack, tmp_path: Path, kind
 
 @pytest.fixture(scope="module")
 def decoded(small: Pack, tmp_path_factory: pytest.TempPathFactory) -> Pack:
-    """A raw pack of the pixels that the pack of JPEGs decodes to."""
     decoded = altered(Toy(), lambda _, item: {m: small.images[m][item] for m in ("vision", "touch")})
     return build(decoded, tmp_path_factory.mktemp("decoded") / "pack", size=32, quiet=True)
 

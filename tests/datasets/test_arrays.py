@@ -424,7 +424,6 @@ def test_truncated_files(tmp_path: Path, keep: int, capsys: pytest.CaptureFixtur
 
 
 def claimed(name: str, **about: Any) -> Callable[[Path], object]:
-    """Change what a dataset of a replay buffer says of itself."""
 
     def change(path: Path) -> None:
         file = path / name / ".zarray"
@@ -481,7 +480,6 @@ def test_npy_files_that_are_no_images(tmp_path: Path, name: str, capsys: pytest.
 
 
 def refused(path: Path, options: dict[str, str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Check that packing ends with exit code 2, one line and no pack."""
     out = path.parent / "out"
     given = {"vision": "camera", "touch": "gel", "values": "force_n:N", "group": "object"} | options
     words = [word for name, value in given.items() if value for word in (f"--{name}", value)]

@@ -203,7 +203,6 @@ def test_lerobot_says_what_is_missing(tmp_path: Path) -> None:
 def changed(
     root: Path, change: Callable[[dict[str, Any]], dict[str, Any]], file: str = "data/chunk-000/file-000"
 ) -> Path:
-    """``root`` with every row of a table changed."""
     path = root / f"{file}.parquet"
     pq.write_table(pa.Table.from_pylist([change(row) for row in pq.read_table(path).to_pylist()]), path)
     return root

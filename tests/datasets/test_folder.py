@@ -81,7 +81,6 @@ def rows(tmp_path: Path) -> Table:
 
 
 def config(path: Path, **options: Any) -> FolderConfig:
-    """A reader of ``make_rows``, small enough to pack at once."""
     given: dict[str, Any] = {"labels": ("material",), "group": "object", "size": 16, "path": path}
     return FolderConfig(**(given | options))
 

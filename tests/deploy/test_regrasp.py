@@ -43,7 +43,6 @@ class Felt(Grasps):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Encoders as a run's folder holds them; nothing here depends on their training."""
     folder = tmp_path_factory.mktemp("felt")
     pack = build(Felt(), folder / "pack", size=16, quiet=True)
     (folder / "run").mkdir()

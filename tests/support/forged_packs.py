@@ -24,7 +24,6 @@ def put(*keys: str | int, value: Any) -> Change:
 
 
 def edited(path: Path, keys: tuple[str, ...], value: Any) -> None:
-    """Write ``value`` at ``keys`` of the JSON in ``path``."""
     content = json.loads(path.read_text())
     content.pop("sha256", None)  # an edit that is meant
     put(*keys, value=value)(content)

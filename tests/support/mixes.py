@@ -55,5 +55,4 @@ def built(source: Toy, path: Path, size: int = 32) -> Pack:
 
 
 def mix_run(*parts: str, **changes: Any) -> Run:
-    """A run of the smoke recipe on a mix; ``data`` changes its options."""
     return replace(recipe("smoke", MixConfig(parts=parts, **changes.pop("data", {})), phased=False), **changes)

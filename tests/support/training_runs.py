@@ -47,7 +47,6 @@ def power_cut(after: int) -> Iterator[None]:
 
 
 def batches(run: Run, pack: Pack, rows: np.ndarray, start: int, num_steps: int) -> list[np.ndarray]:
-    """Pack rows of each step from ``start`` to ``num_steps``."""
     order = Batches(run, pack, rows)
     return [order[step] for step in range(start, num_steps)]
 

@@ -32,7 +32,6 @@ from support.training_runs import power_cut, smoke, train_twice, weights
 
 
 def started(pack: Pack, init: Init, **changes: object) -> tuple[Run, torch.nn.Module, dict[str, list[str]]]:
-    """A method before its first step, which starts from ``init``, and what it took."""
     run = smoke(pack, seed=5, init=init.resolved(), **changes)
     start = read_start(run.init)
     torch.manual_seed(run.seed)

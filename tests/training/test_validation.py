@@ -27,7 +27,6 @@ LINEAR = tuple(f"{m}/linear {task}" for m in ("vision", "touch", "both") for tas
 
 @pytest.fixture(scope="module")
 def run(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Learns fast enough to get better or worse at every evaluation."""
     changes = {"steps": 8, "eval_every": 2, "checkpoint_every": 2, "optim": Optim(name="adamw", lr=0.01)}
     return train(smoke(pack, **changes), tmp_path_factory.mktemp("validation") / "run", quiet=True)
 
