@@ -123,7 +123,6 @@ def test_frames_are_upright(made: dict[str, Path], tmp_path: Path) -> None:
 
 @pytest.fixture
 def count(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
-    """How often the decoder is started and how many packets it gets."""
     counted = {"runs": 0, "packets": 0}
     start, decode = video._Run.__init__, video._Run._decoded
 

@@ -378,13 +378,11 @@ def test_bad_files_are_named_in_one_line(tmp_path: Path, name: str, capsys: pyte
 
 
 def sparse(file: h5py.File, name: str, shape: tuple[int, ...], kind: str = "u1") -> None:
-    """A dataset of zeros that takes no room in the file."""
     del file[name]
     file.create_dataset(name, shape, kind, chunks=tuple(min(n, 64) for n in shape))
 
 
 def elsewhere(file: h5py.File, name: str, *, virtual: bool) -> None:
-    """A dataset of the same shape that shows another file."""
     shape, kind = file[name].shape, file[name].dtype
     del file[name]
     if virtual:

@@ -25,6 +25,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import UNGROUPED
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.table.columns import Condition
+from mvitac.datasets.table.manifest import Manifest
 from mvitac.datasets.table.splits import assign_splits
 from mvitac.datasets.table.table import Rows
 from mvitac.system.files import cache_dir
@@ -507,6 +508,8 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
     (tmp_path / "half flat/touch/a/1.png").symlink_to("not fetched")
     with pytest.raises(ValueError, match=r"1 of 2 image files are missing or empty, e.g. row 1 touch touch/a/1\.png"):
         FolderConfig(path=tmp_path / "half flat").source()
+    with pytest.raises(ValueError, match="column 'touch' has 1 images for 2 rows"):
+        Manifest.of(tmp_path, [{"a": "0"}, {"a": "1"}], {"touch": [None]})
     (tmp_path / "same.csv").write_text("touch,split\na.png,train\nb.png,test\n")
     picture(tmp_path / "a.png")
     (tmp_path / "b.png").symlink_to("a.png")

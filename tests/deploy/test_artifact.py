@@ -18,7 +18,7 @@ from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import fitting
 from mvitac.evaluation.probe import split_rows
 from mvitac.model import load
-from support.toy import with_columns
+from support.toy import toy_pack, with_columns
 
 
 def test_predicts_what_the_probe_scored(smoke_run: Path, artifact: Path, pack: Pack) -> None:
@@ -89,6 +89,8 @@ def test_difference_images_are_told(smoke_run: Path, pack: Pack, tmp_path: Path)
     for pair in ((mvitac.load(smoke_run), minus), (found, pack)):
         with pytest.raises(ValueError, match="difference images"):
             fit_probes(*pair)
+    with pytest.raises(ValueError, match="has images of 24 px, in use they are shrunk to 32: pack it so"):
+        fit_probes(mvitac.load(smoke_run), toy_pack(tmp_path / "other", size=24))
     with pytest.raises(ValueError, match="trained without difference images"):
         export(mvitac.load(smoke_run), minus, tmp_path / "e", ExportConfig())
 

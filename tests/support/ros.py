@@ -12,13 +12,11 @@ STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 
 def stamped(time: float) -> Any:
-    """A header of ``time`` seconds after START."""
     stamp = STORE.types["builtin_interfaces/msg/Time"](sec=START + int(time), nanosec=round(time % 1 * 1e9))
     return STORE.types["std_msgs/msg/Header"](stamp=stamp, frame_id="")
 
 
 def raw(time: float, pixels: np.ndarray, encoding: str) -> Any:
-    """An Image whose lines end in 4 bytes of padding."""
     lines = np.pad(pixels.reshape(pixels.shape[0], -1).view(np.uint8), ((0, 0), (0, 4)))
     shape = {"height": pixels.shape[0], "width": pixels.shape[1], "encoding": encoding, "is_bigendian": 0}
     kind = STORE.types["sensor_msgs/msg/Image"]

@@ -170,5 +170,4 @@ def film(pack: Pack, folder: Path, *, rest: int, num: int, fps: int) -> list[str
 
 
 def threads_of(first: int, end: int) -> Any:
-    """A reader that gives the numbers of threads of the libraries of its process."""
     return [library["num_threads"] for library in threadpool_info()]

@@ -189,7 +189,7 @@ def predict(argv: list[str]) -> None:
         raise ValueError(f"{options.model} has no probes of classes or values: export it on data that has labels")
     if config:
         pack = _opened(config, given, engine)
-        for note in (note for note in pack.spec.notes if "left out" in note):
+        for note in (note for note in pack.spec.notes if "left out" in note or "are not there" in note):
             _say(f"note: {note}")
         for m in [m for m in engine.inputs if pack.spec.crop.get(m) != engine.crop.get(m)]:
             have, wanted = (crop.get(m, "whole images") for crop in (pack.spec.crop, engine.crop))

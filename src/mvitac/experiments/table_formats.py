@@ -206,7 +206,6 @@ def comma(result: dict[str, Any]) -> str:
 
 
 def _csv_row(key: Sequence[str], cell: dict[str, Any], control: bool, target: bool) -> dict[str, Any]:
-    """One line of the CSV. An interval without an end is empty."""
     source, probe, modality, task, name = key
     row = {"row": source, "control": int(control), "probe": probe, "modality": modality, "task": task}
     row |= {"accuracy": cell["mean"], "low": cell["low"], "high": cell["high"], "seeds": max(1, len(cell["seeds"]))}

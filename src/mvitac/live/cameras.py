@@ -233,7 +233,6 @@ def source(text: str, modality: str) -> Source:
 
 
 def _place(text: str) -> tuple[Path, float]:
-    """Path and rate of a video or folder[@fps]."""
     name, _, rate = text.rpartition("@")
     if not (name and Path(name).is_dir()):
         return Path(text), 30.0

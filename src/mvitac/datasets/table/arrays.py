@@ -170,7 +170,6 @@ def _holds_images(data: Any) -> bool:
 
 
 def _seen(datasets: dict[str, Any]) -> str:
-    """Describe the datasets that may hold images, one of each name."""
     longest_first = sorted(datasets, key=lambda path: (len(path), path), reverse=True)
     named = {path.rpartition("/")[2]: path for path in longest_first if datasets[path].ndim > 2}
     return ", ".join(f"{path} {list(datasets[path].shape)}" for path in sorted(named.values())[:6])

@@ -158,7 +158,6 @@ def _parsed(text: str) -> tuple[str, str, float]:
 
 
 def _files(table: Manifest, name: str, refs: Sequence[ImageRef | None]) -> dict[Path, list[int]]:
-    """Return the log of each row -> the rows."""
     files: dict[Path, list[int]] = {}
     for i, ref in enumerate(refs):
         beside = Path(ref.path) if ref else table.root / "."

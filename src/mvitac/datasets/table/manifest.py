@@ -60,6 +60,8 @@ class Manifest:
         """
         if not rows:
             raise ValueError(f"{path} holds no rows: is it the right one, and whole?")
+        for column in (column for column, refs in (images or {}).items() if len(refs) != len(rows)):
+            raise ValueError(f"{path}: column {column!r} has {len((images or {})[column])} images for {len(rows)} rows")
         names = dict.fromkeys(name for row in rows for name in row)
         rows = [{name: row.get(name, "") for name in names} for row in rows]
         where = {c: [str(ref).removeprefix(str(path)) for ref in refs] for c, refs in (images or {}).items()}
