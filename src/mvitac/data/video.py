@@ -186,7 +186,6 @@ class _Run:
 
 
 def _shown(packet: Packet) -> int:
-    """The display time of a packet's frame, in the stream's time base."""
     time = packet.pts if packet.pts is not None else packet.dts
     if time is None:
         raise ValueError("its frames carry no times: convert it, e.g. with ffmpeg -i IN -c:v copy OUT.mp4")

@@ -111,7 +111,6 @@ def above(own: dict[str, Any], controls: dict[str, dict[str, Any]]) -> str:
 
 
 def _low(cell: dict[str, Any]) -> float:
-    """Lower end of an interval; R2 may have none."""
     return -math.inf if cell["low"] is None else cell["low"]
 
 
