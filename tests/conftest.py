@@ -72,7 +72,6 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def smoke_run(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run of eight steps on the striped pairs."""
     from mvitac.training.loop import train
     from support.training_runs import smoke
 

@@ -53,11 +53,11 @@ def test_wrong_arguments_are_refused_before_torch_is_imported() -> None:
 
 def test_a_method_of_ones_own_is_known(smoke_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No stored help lists it; and whoever opens its run without it is told so."""
-    monkeypatch.setitem(MethodConfig.choices, "mine", MethodConfig)
+    monkeypatch.setattr(MethodConfig, "choices", MethodConfig.choices | {"mine": MethodConfig})
     _check_choices(["--method", "mine"], help_file("pretrain"))
     with pytest.raises(ValueError, match="unknown method 'mime': choose from"):
         _check_choices(["--method", "mime"], help_file("pretrain"))
-    monkeypatch.delitem(MethodConfig.choices, "mvitac")
+    monkeypatch.setattr(MethodConfig, "choices", {"mine": MethodConfig})
     with pytest.raises(ValueError, match=r"model.safetensors: unknown method 'mvitac': .* once its module is imported"):
         load(smoke_run)
 

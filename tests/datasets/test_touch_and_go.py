@@ -254,7 +254,6 @@ def test_a_frame_without_a_label_is_left_out(tree: Path, tmp_path: Path) -> None
 
 
 def test_the_cache_knows_changed_jpegs(tmp_path: Path) -> None:
-    """Another frame in place of a listed one, of whatever size."""
     for name, side in zip(NAMES[:2], ("train", "test"), strict=True):
         for task in ("", "_rough"):
             (tmp_path / f"{side}{task}.txt").write_text("\n".join(f"{name}/{i:010d}.jpg,{i % 2}" for i in range(6)))

@@ -234,7 +234,6 @@ def test_retrieval_has_one_number_for_one_thing() -> None:
 
 
 def texts_of(records: Sequence[dict[str, Any]]) -> dict[tuple[str, ...], str]:
-    """(task, modality, source) -> score and interval as text."""
     cells: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for r in (r for r in records if "group_correct" in r):  # of tasks with classes
         cells.setdefault((r["task"], r["modality"], r["source"]), []).append(r)

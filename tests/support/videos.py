@@ -107,5 +107,4 @@ def level(image: np.ndarray) -> float:
 
 
 def film(path: Path, num: int, which: int = 0, size: tuple[int, int] = (64, 48), rate: int = 25) -> Path:
-    """A video whose frame i is all of ``shade(i)``."""
     return write_video(path, num, lambda i: np.full((size[1], size[0], 3), shade(i, which), np.uint8), rate=rate)

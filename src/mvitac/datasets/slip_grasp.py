@@ -56,7 +56,7 @@ def _grasps(root: Path, file: Path) -> list[dict[str, str]]:
         words = line.split()
         if not words:
             continue
-        if len(words) != 8 or words[2] not in ("0", "1"):
+        if len(words) != 8 or words[2] not in ("0", "1") or "/" in words[6]:  # the folder, which is one of the object's
             raise ValueError(f"{file} line {number}: {line!r} is not a grasp of eight words")
         width, _, success, _, _, key, folder, _ = words
         pairs: dict[int, dict[str, str]] = defaultdict(dict)
