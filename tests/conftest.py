@@ -35,7 +35,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Packs and features of the tests live and die with them."""
     from support import warm  # noqa: F401
 
     path = tmp_path_factory.mktemp("cache")

@@ -65,7 +65,6 @@ def test_whole_images_are_seen_at_their_own_size(model: Model, pack: Pack) -> No
 
 
 def kinds(array: np.ndarray, folder: Path) -> dict[str, Any]:
-    """One uint8 image [H, W, 3] in every form that ``embed`` takes."""
     picture, tensor = Image.fromarray(array), torch.from_numpy(array.copy())
     picture.save(folder / "image.png")
     return {

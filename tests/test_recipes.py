@@ -88,7 +88,6 @@ def test_a_grasps_phases_are_not_each_others_positives(pack: Pack) -> None:
 
 @pytest.fixture(scope="module")
 def grasps(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four simulated grasps as a pack, and as files with a manifest."""
     root = tmp_path_factory.mktemp("grasps")
     pack = build(GraspsConfig(num=4, size=32).source(), root / "pack", size=32, quiet=True)
     rows = []

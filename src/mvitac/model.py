@@ -335,7 +335,7 @@ def load(path: str | Path, which: Which = "last") -> Model:
             raise ValueError(f"stored {stored}: expected 1 to {MAX_STORED} px")
     except (KeyError, ValueError) as error:
         if str(error).startswith("unknown method"):
-            raise ValueError(f"{file}: {error}; one's own is known once its module is imported") from None
+            raise ValueError(f"{file}: {error}; one of your own is known once its module is imported") from None
         raise ValueError(f"{file} has a damaged header ({brief(error)}): copy it again or re-train") from None
     beside = file.with_name("run.json")  # and with it the list of rows that the run learned from
     own = run if foreign or not beside.exists() else replace(load_run(beside)[0], precision=run.precision)

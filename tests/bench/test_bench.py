@@ -95,7 +95,6 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def results(root: Path, smoke_run: Path) -> list[Path]:
-    """Results of a trained run and of two random trunks."""
     toys, out = find_suite(str(root / "toys.toml")), root / "results"
     places = [str(smoke_run)], [RANDOM.format(5), RANDOM.format(6)]
     return [run_bench(place, toys, out, root, About()) for place in places]
@@ -331,6 +330,11 @@ def other_unit(value: dict[str, Any]) -> None:
         sums["squared_value"] = (np.square(sums["value"]) / np.maximum(sums["n"], 1)).tolist()
 
 
+def simulated_values(value: dict[str, Any]) -> None:
+    value["suite"]["sets"][0]["tasks"][1]["name"] = value["blocks"][1]["task"] = "force"
+    own_data({"name": "materials"}, value)
+
+
 def own_data(data: dict[str, Any], value: dict[str, Any]) -> None:
     form = value["suite"]["sets"][0]["forms"][0]
     form |= {"data": data, "at": form["at"] if data["name"] == "folder" else {}}
@@ -356,7 +360,6 @@ def other_frames(value: dict[str, Any]) -> None:
 
 
 def simulated(value: dict[str, Any]) -> None:
-    """Of a set that can be made anywhere, nothing was run."""
     value["suite"]["sets"][2]["forms"][0]["at"] = {}
     value["suite_digest"] = suite_of(value).digest()
 
@@ -431,6 +434,7 @@ FORGED: dict[str, tuple[Change, str]] = {
         partial(own_data, {"name": "folder", "controls": ["width = w,h"]}),
         "lacks width, none, linear, None",
     ),
+    "values of simulated data": (simulated_values, r"its values are .*, those of the suite \[\['force_n', 'N'\]\]"),
     "control of simulated data": (partial(own_data, {"name": "grasps"}), "lacks contact only, none, linear"),
     "note": (put("blocks", 0, "notes", value=[5]), "a leak mark, a note, a group or what groups are is no text"),
     "clipped of what": (put(*VALUES, "clipped", value=[9]), r"it says that \[9\] features were clipped"),

@@ -161,7 +161,6 @@ def nothing():
 
 @pytest.fixture
 def functions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """What names the functions of FACTORY, which are in the current folder."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "nets_here.py").write_text(FACTORY)
     return "external:python:nets_here:"

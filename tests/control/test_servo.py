@@ -209,7 +209,6 @@ def test_constant_features_are_no_copies(done: Path, tmp_path: Path) -> None:
 
 
 def measured(name: str, *rows: tuple[str, int | None, float]) -> dict[str, Any]:
-    """A result of eight straight edges; ``rows``: source, seed and mm."""
     cell = {"task": "straight", "condition": "late", "n": [4.0] * 8, "deg": [0.0] * 8, "lost": [0.0] * 8}
     cells = ({"source": s, "seed": k, "cells": [cell | {"mm": [4 * mm] * 8}]} for s, k, mm in rows)
     return {"rows": list(cells), "encoder": {"name": name}}

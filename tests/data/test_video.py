@@ -29,7 +29,6 @@ KINDS: dict[str, tuple[str, dict[str, Any]]] = {
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """One numbered video of every kind that this PyAV can encode."""
     folder = tmp_path_factory.mktemp("videos")
     return {
         name: write_video(folder / name / file, NUM, lambda i: numbered(i, "touch"), **options)

@@ -36,7 +36,6 @@ Table = list[dict[str, Any]]
 
 
 def colour(row: int, which: int) -> tuple[int, int, int]:
-    """A colour that belongs to one image of one row alone."""
     return (10 * row, 80 * which, 255 - 5 * row)
 
 
@@ -131,7 +130,6 @@ def test_paths_are_relative_to_the_manifest_and_the_fingerprint_to_nothing(tmp_p
 
 
 def write_plain(folder: Path, level: int, when: int) -> FolderConfig:
-    """40 plain pictures, files of one size, all written at second ``when``."""
     names = [f"{i}.bmp" for i in range(40)]
     for name in names:
         os.utime(picture(folder / name, level), (when, when))
@@ -506,6 +504,7 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
             FolderConfig(path=tmp_path / folder).source()
     (tmp_path / "half flat/touch/1.png").unlink()
     (tmp_path / "half flat/touch/a/1.png").symlink_to("not fetched")
+    (tmp_path / "half flat/touch/.cache").symlink_to(tmp_path / "lonely")  # nothing hidden is read
     with pytest.raises(ValueError, match=r"1 of 2 image files are missing or empty, e.g. row 1 touch touch/a/1\.png"):
         FolderConfig(path=tmp_path / "half flat").source()
     with pytest.raises(ValueError, match="column 'touch' has 1 images for 2 rows"):

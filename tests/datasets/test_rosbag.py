@@ -56,6 +56,7 @@ def test_topics_are_joined_by_the_time_in_their_headers(tmp_path: Path, plugin: 
         write_bag(tmp_path / f"bags/grasp.{number}", plugin, number)
     options: dict[str, Any] = {"touch": (GEL,), "vision": FRONT, "values": (f"{WRENCH}.wrench.force.z:N",), "size": 16}
     config = RosbagConfig(path=tmp_path / "bags", every=1, tolerance=0.045, **options)
+    assert replace(config, interpolate="nearest").source().items()  # values are joined without --log, too
     pack = packed(config, tmp_path / "pack")
     time, which = pack.column("time").astype(float) - START, pack.column("recording")
     assert set(which) == {"grasp.0", "grasp.1", "grasp.2"} and pack.spec.group_by == "recording"
@@ -167,8 +168,10 @@ def test_depth_and_what_cannot_be(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=says):
             RosbagConfig(path=bag, **options).source()
     file = bag / "bag.mcap"
-    file.write_bytes(file.read_bytes()[:5000])
-    with pytest.raises(ValueError, match=r"cannot be read as a bag \(.*\): is it complete"):
-        RosbagConfig(path=bag, touch=(GEL,)).source()
+    whole = file.read_bytes()
+    for harmed in (whole[:5000], whole.replace(GEL.encode(), b"\xff" * len(GEL))):  # cut, and no UTF-8
+        file.write_bytes(harmed)
+        with pytest.raises(ValueError, match=r"bag cannot be read as a bag \(.*\): is it complete"):
+            RosbagConfig(path=bag, touch=(GEL,)).source()
     with pytest.raises(ValueError, match="is no bag and holds none"):
         RosbagConfig(path=tmp_path / "none", touch=(GEL,)).source()

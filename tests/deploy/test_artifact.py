@@ -89,7 +89,7 @@ def test_difference_images_are_told(smoke_run: Path, pack: Pack, tmp_path: Path)
     for pair in ((mvitac.load(smoke_run), minus), (found, pack)):
         with pytest.raises(ValueError, match="difference images"):
             fit_probes(*pair)
-    with pytest.raises(ValueError, match="has images of 24 px, in use they are shrunk to 32: pack it so"):
+    with pytest.raises(ValueError, match="has images of 24 px: pack it again with --size 32"):
         fit_probes(mvitac.load(smoke_run), toy_pack(tmp_path / "other", size=24))
     with pytest.raises(ValueError, match="trained without difference images"):
         export(mvitac.load(smoke_run), minus, tmp_path / "e", ExportConfig())

@@ -317,7 +317,6 @@ def test_a_camera_is_asked_for_a_mode(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def heard(rig: type[Rig], clock: Clock) -> list[Event]:
-    """What is said of a sensor that breaks and comes back."""
     sensor, said = rig(clock, 0), []
     sensor.stream = stream = Stream("touch", sensor, clock=clock)
     stream.tell = said.append

@@ -1,6 +1,7 @@
 """Recordings: every frame has its number, its time and the answer that the engine gives for it."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import h5py
@@ -9,6 +10,7 @@ import pyarrow.csv
 import pytest
 from PIL import Image
 
+from mvitac.cli.live import _opened
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.images import difference, fit
@@ -27,7 +29,6 @@ FIRST = LiveConfig(calibration=8)
 
 @pytest.fixture(scope="module")
 def films(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """50 frames of touch at 25 a second, 20 without contact, and 24 of vision at 12."""
     folder, noise = tmp_path_factory.mktemp("films"), np.random.default_rng(0).integers(0, 4, (NUM, 120, 160, 3))
 
     def touch(number: int) -> np.ndarray:
@@ -172,6 +173,10 @@ def test_predict_command(
             file[f"data/{name}"] = data
     assert main([*command, str(tmp_path / "a.h5"), "--out", str(out)]) == 0
     assert "note: a.h5: data/lost is left out: it has no images" in capsys.readouterr().err
+    (tmp_path / "free.csv").write_text("touch,background\ntouch.png,touch.png\n")
+    minus = SimpleNamespace(inputs={"touch": (32, 32, 3)}, difference=True)  # of a model of difference images
+    own = _opened(FolderConfig(path=tmp_path / "free.csv", allow_leak=True), {"vision": (), "touch": ()}, minus)
+    assert own.spec.difference and (own.images["touch"] == 128).all()
     (tmp_path / "gel.csv").write_text("touch\ntouch.png\n")
     (empty := tmp_path / "empty").mkdir()
     wrong = {

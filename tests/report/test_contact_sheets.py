@@ -33,7 +33,6 @@ def test_without_labels_every_group_is_a_class(pack: Pack) -> None:
 
 
 def places(picture: np.ndarray, image: np.ndarray) -> list[tuple[int, int]]:
-    """Where ``image`` is in ``picture``: (top, left)."""
     height, width = image.shape[:2]
     corners = np.argwhere((picture[: 1 - height, : 1 - width] == image[0, 0]).all(2)).tolist()
     return [(y, x) for y, x in corners if np.array_equal(picture[y : y + height, x : x + width], image)]

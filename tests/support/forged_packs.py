@@ -13,7 +13,6 @@ Change = Callable[[Any], object]
 
 
 def put(*keys: str | int, value: Any) -> Change:
-    """``value`` at ``keys``, or what it makes of the old one there."""
 
     def change(inner: Any) -> None:
         for key in keys[:-1]:

@@ -21,7 +21,6 @@ def small(pack: Pack, **changes: object) -> Plan:
 
 
 def compared(result: dict[str, Any]) -> dict[str, Any]:
-    """``result`` of ``probe_runs`` as that of a comparison of one row."""
     kept: dict[str, Any] = {"left_out": {}, "failed": {}, "unfinished": [], "leaks": "", "cost": [], "commit": None}
     kept |= {"run_commits": [], "run_devices": ["cpu"], "run_precisions": {}, "notes": []}
     plan = Plan(name="one", rows=(Row(label="mvitac"),), reference="mvitac", recipe="smoke", probes=("linear", "knn"))

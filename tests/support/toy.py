@@ -126,7 +126,6 @@ def altered(source: Source, change: Callable[[Sample, int], dict[str, Any]] = la
 
 
 def with_columns(pack: Pack, *, spec: DataSpec | None = None, **columns: Any) -> Pack:
-    """``pack`` with other columns in its table, and another spec, in memory."""
     made, cached = copy.copy(pack), {name for name, kind in vars(Pack).items() if isinstance(kind, cached_property)}
     made.__dict__ = {name: value for name, value in vars(pack).items() if name not in cached}
     made.spec = spec or pack.spec

@@ -59,7 +59,6 @@ def test_stopped_and_resumed_equals_straight(pack: Pack, smoke_run: Path, tmp_pa
 
 
 def cut_after(num: int, pack: Pack, out: Path) -> Run:
-    """A run that dies after ``num`` steps, with a checkpoint of every second one."""
     run = smoke(pack, checkpoint_every=2)
     with power_cut(num), pytest.raises(RuntimeError, match="power cut"):
         train(run, out, quiet=True)

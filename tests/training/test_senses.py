@@ -42,7 +42,6 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def started(pack: Pack, file: Path, **vision: object) -> Run:
-    """MViTac with momentum keys, vision from the file."""
     encoder = replace(TWO, vision=replace(TWO.vision, weights=str(file), **vision))  # type: ignore[arg-type]
     method = MViTacConfig(hidden=32, out=16)
     return smoke(pack, encoder=encoder, augment=SIZES, method=method, steps=4, eval_every=0, checkpoint_every=2)

@@ -18,6 +18,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack
 from mvitac.data.spec import AnyTask, DataSpec, Task
 from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.simulated import SimulatedConfig
 from mvitac.datasets.table.splits import folds
 from mvitac.evaluation.probe import VALUE_PROBES
 from mvitac.evaluation.probe_config import Probe
@@ -157,8 +158,9 @@ def _config(form: Form, root: Path, options: dict[str, Any]) -> DatasetConfig:
 
 
 def simulated_spec(form: Form) -> DataSpec | None:
-    """The spec of data that needs no files; None of other data."""
-    return None if form.at else _config(form, Path(), form.data).source().spec()
+    """The spec of data that is simulated, which needs no files; None of other data."""
+    config = _config(form, Path(), form.data)
+    return config.source().spec() if isinstance(config, SimulatedConfig) else None
 
 
 @dataclass(frozen=True)

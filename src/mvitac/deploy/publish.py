@@ -44,9 +44,7 @@ def fit_probes(model: Model, pack: Pack) -> list[tuple[LinearProbe, dict[str, An
     """
     modalities = fitting(model, pack, in_use=True)
     if pack.size != model.stored:  # images in use are shrunk to that first: features would be others
-        raise ValueError(
-            f"{pack.path} has images of {pack.size} px, in use they are shrunk to {model.stored}: pack it so"
-        )
+        raise ValueError(f"{pack.path} has images of {pack.size} px: pack it again with --size {model.stored}")
     tasks = {m: scorable(pack, m) for m in (*modalities, *(["both"] if len(modalities) == 2 else []))}
     records: Records = []
     fitted: FittedProbes = {}

@@ -253,7 +253,7 @@ class Rows(Source):
         config, listed = self._config, table.path.suffix.lower() in READERS
         idle: dict[str, Any] = {"pictures": listed and "the table names its images"}
         alone = not config.log and "--data.log names no other clock"
-        idle |= {"tolerance": listed and alone, "interpolate": alone}
+        idle |= {"tolerance": listed and alone, "interpolate": config.name != "rosbag" and alone}
         given = self._split != BY_GROUP and f"column {self._split!r} says the split"
         idle |= dict.fromkeys(("test_share", "val_share", "split_seed"), given)
         for name, why in idle.items():
