@@ -83,13 +83,11 @@ def _seeds_alike(blocks: Sequence[dict[str, Any]]) -> list[str]:
         none = [record["sums"] for record in records if record["modality"] == "none"]
         own = [record for record in records if not record["source"] and record["sums"] not in none]
         for one, other in itertools.combinations(own, 2):
-            same, sure = one["sums"] == other["sums"], "targets" in one and one["probe"] != "knn"
-            if one["modality"] == other["modality"] and one["probe"] == other["probe"] and (sure or not same):
-                alike.setdefault((one["modality"], one["seed"], other["seed"]), set()).add(same)
-    pairs = [key for key, found in alike.items() if len(found) > 1]
-    return [
-        f"the encoder by {m}: seeds {one} and {other} have the same values in some tasks" for m, one, other in pairs
-    ]
+            equal, sure = one["sums"] == other["sums"], "targets" in one and one["probe"] != "knn"
+            if one["modality"] == other["modality"] and one["probe"] == other["probe"] and (sure or not equal):
+                alike.setdefault((one["modality"], one["seed"], other["seed"]), set()).add(equal)
+    same = "have the same values in some tasks"
+    return [f"the encoder by {m}: seeds {a} and {b} {same}" for (m, a, b), both in alike.items() if len(both) > 1]
 
 
 def _senses(modality: str) -> set[str]:

@@ -311,7 +311,8 @@ class Rows(Source):
                 splits.check_leak(where, column, what, names, found)
             for names in filter(None, (self._images[: bool(self._vision)], self._touch)):  # left here, right there
                 there = [(ref, at) for name in names for ref, at in zip(table.images[name], found, strict=True) if ref]
-                images = [os.path.realpath(str(ref)) for ref, _ in there]
+                paths = [str(ref) for ref, _ in there]  # links are rare, and to follow them is slow
+                images = [*map(os.path.realpath if any(map(os.path.islink, paths)) else os.path.normpath, paths)]
                 splits.check_leak(where, column, f"{' and '.join(names)} images", images, [side for _, side in there])
         splits.check_sides(where, column, found, tasks, labels, len(set(groups)))
         return found
