@@ -79,6 +79,20 @@ def test_what_is_stopped_says_the_command_that_goes_on(
         assert capsys.readouterr().err.endswith(f"; continue: mvitac {words}{again}\n")
 
 
+def test_advice_is_of_the_command_and_home_is_read(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", "/home/me")
+    for name, advice in {
+        "data": "--order",
+        "predict": "--order of mvitac data pack",
+        "pretrain": "--data.order",
+    }.items():
+        monkeypatch.setattr("mvitac.cli.main._run", run := Mock(side_effect=ValueError("name --data.order")))
+        assert main([name, "--out=~/x"]) == 2 and capsys.readouterr().err == f"mvitac: error: name {advice}\n"
+        assert run.call_args.args == ([name, "--out=/home/me/x"],)
+
+
 def test_a_path_is_data(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A pack, a table, a folder; a name of a dataset is that, also beside a folder of this name."""
     (tmp_path / "pairs.csv").touch()

@@ -17,7 +17,15 @@ import pytest
 from mvitac.bench.suite import find_suite, open_set
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
-from mvitac.datasets.calandra import AUTHORS_TEST, AUTHORS_TRAIN, PHASES, Calandra, CalandraConfig, owners_shuffle
+from mvitac.datasets.calandra import (
+    AUTHORS_TEST,
+    AUTHORS_TRAIN,
+    PHASES,
+    Calandra,
+    CalandraConfig,
+    list_grasps,
+    owners_shuffle,
+)
 from mvitac.datasets.simulated import GraspsConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.probe import split_rows
@@ -107,10 +115,13 @@ def test_a_pack_depends_on_what_the_shards_hold_and_when_they_were_written(folde
 
 
 def test_object_names_are_repaired(tmp_path: Path) -> None:
-    write_shard(tmp_path, 0, [b"plastic_duc", b"plastic_duck", b" lemon\0", "lime", b"hair_dryer_"])
+    path = write_shard(tmp_path, 0, [b"plastic_duc", b"plastic_duck", b" lemon\0", "lime", b"hair_dryer_"])
     source = Calandra(CalandraConfig(path=tmp_path, split="object"))
     names = [source.read(i)[0].columns["group"] for i in range(5)]
     assert names == ["plastic_duck", "plastic_duck", "lemon", "lime", "hair_dryer_spiky_nozzle"]
+    with h5py.File(path, "a") as file:
+        file["data/i1"].attrs.create("object_name", b"\xff", dtype=h5py.string_dtype())
+    assert [bool(grasp.damage) for grasp in list_grasps(path)] == [False, True, False, False, False]
 
 
 def test_outcome_as_pytables_stores_it(tmp_path: Path) -> None:

@@ -509,11 +509,14 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
         FolderConfig(path=tmp_path / "half flat").source()
     with pytest.raises(ValueError, match="column 'touch' has 1 images for 2 rows"):
         Manifest.of(tmp_path, [{"a": "0"}, {"a": "1"}], {"touch": [None]})
-    (tmp_path / "same.csv").write_text("touch,split\na.png,train\nb.png,test\n")
+    assert Manifest.of(tmp_path, ({"a": cell} for cell in (1, 2.0, None))).rows == [{"a": "1"}, {"a": "2"}, {"a": ""}]
+    (tmp_path / "same.csv").write_text("touch,split,n\na.png,train,1\nb.png,test,2\n")
     picture(tmp_path / "a.png")
     (tmp_path / "b.png").symlink_to("a.png")
     with pytest.raises(ValueError, match="1 of 1 touch images are in more than one split"):
         FolderConfig(path=tmp_path / "same.csv").source()
+    with pytest.raises(ValueError, match=f"^{tmp_path / 'same.csv'}: every touch has one row"):
+        FolderConfig(path=tmp_path / "same.csv", allow_leak=True, order="n", minus_first=True, size=16).open(quiet=True)
     (tmp_path / "half flat/touch/b").symlink_to(tmp_path / "lonely")
     with pytest.raises(ValueError, match="touch/b is a link to a folder: put the folder in its place"):
         FolderConfig(path=tmp_path / "half flat").source()

@@ -178,6 +178,13 @@ def test_slip_grasp_labels_no_late_frame_where_early_ones_are_lost(tmp_path: Pat
     )
     with pytest.raises(ValueError, match=r"line 1: .* is not a grasp of eight words"):
         SlipGraspConfig(path=tmp_path).manifest()
+    file.write_bytes(b"\xff\xfe 1 0 1 2 x y z")
+    with pytest.raises(ValueError, match=r"object001_result.dat line 1: .* is not a grasp of eight words"):
+        SlipGraspConfig(path=tmp_path).manifest()
+    file.unlink()
+    assert SlipGraspConfig(path=tmp_path).source().spec().notes == (
+        "object001 is left out: object001_result.dat says nothing of it",
+    )
 
 
 def test_slip_grasp_pairs_by_frame(packs: dict[str, Pack]) -> None:
@@ -248,6 +255,9 @@ def test_physiclear_newer_layout_and_missing_labels(clones: Path, tmp_path: Path
     file = tmp_path / "new/src/utils/constants.py"
     file.write_text(file.read_text().replace("TEXTURE_RANK", "OTHER"))
     with pytest.raises(ValueError, match="does not define TEXTURE_RANK"):
+        PhysiclearConfig(path=tmp_path / "new").source()
+    file.write_text(file.read_text() + "TEXTURE_RANK = ['physiclear_thing_1']\n")
+    with pytest.raises(ValueError, match="TEXTURE_RANK is no dict of names"):
         PhysiclearConfig(path=tmp_path / "new").source()
 
 

@@ -1,5 +1,6 @@
 """Real and simulated presses of one ball: what the labels say is where the picture changes."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from mvitac.data.build import build
 from mvitac.data.several import JoinedPack
+from mvitac.datasets import taxim
 from mvitac.datasets.taxim import TaximConfig
 from mvitac.sim.ball import FIELD_MM
 
@@ -46,6 +48,19 @@ def test_real_frames_are_only_scored_and_depth_is_known_of_one_ball(tmp_path: Pa
     assert depth[0] == pytest.approx(2 - np.sqrt(4 - (63 * 0.0295) ** 2))
     assert len({*real.column("group")[sensor == "gelsight_mini"]}) == 3
     assert [task.name for task in JoinedPack(learned, real).spec.all_tasks] == ["place", "radius", "depth"]
+
+
+@pytest.mark.parametrize("radius", [-1, 80, math.nan])
+def test_a_damaged_calibration_is_named(radius: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    whole = {"imgs": np.zeros((2, 480, 640, 3), np.uint8), "f0": np.zeros((480, 640, 3), np.uint8)}
+    np.savez(tmp_path / "dataPack.npz", **whole, touch_center=np.full((2, 2), 99), touch_radius=np.array([60, radius]))
+    monkeypatch.setattr("mvitac.datasets.taxim.measured.folder", lambda make: tmp_path)
+    taxim._pack.cache_clear()
+    with pytest.raises(ValueError, match=r"dataPack.npz is damaged \(a circle"):
+        TaximConfig(makes=("gelsight",)).source().items()
+    (tmp_path / "dataPack.npz").write_bytes(b"PK\3\4")
+    with pytest.raises(ValueError, match=r"dataPack.npz is damaged"):
+        TaximConfig(makes=("gelsight",)).source().items()
 
 
 def test_real_frames_of_a_sensor_that_has_none_are_an_error():

@@ -186,6 +186,8 @@ def test_methods_of_these_plans_see_equally_many_images(pack: Pack, name: str) -
         ('reference = "a"\n[[rows]]\nlabel = "a"\n[[rows]]\nlabel = "A"', "two labels are one"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\nset = {seed = 3}', "runs have the seeds 0"),
         ('reference = "a"\nset = {device = "cpu"}\n[[rows]]\nlabel = "a"', "device: give --device instead"),
+        ('reference = "a"\n[[rows]]\nlabel = "a"\nset = {recipe = "paper"}', "recipe: give --recipe"),
+        ('reference = "a"\nset = {data.score_on = "val"}\n[[rows]]\nlabel = "a"', "give --data.score-on"),
         ('reference = "pixels"\n[[rows]]\nlabel = "pixels"', "row 'pixels' has the name of a control"),
     ],
 )
@@ -206,7 +208,10 @@ def test_changed_fields_are_checked() -> None:
     run = recipe("smoke")
     assert changed(run, {"optim.lr": 1, "steps": 7}).optim.lr == 1.0
     assert changed(run, {"data.num_frames": 4}).data.num_frames == 4  # not written to files at its default
-    assert changed(run, {}) == run
+    assert changed(run, {}) == run and replace(TABLE1, set={"method": {"temperature": 0.2}}).set
+    assert (
+        run.steps and changed(run, {"epochs": 2}).steps is None and changed(run, {"epochs": 2, "steps": 5}).steps == 5
+    )
     for name in ("optim.lrr", "steps.more", "nothing", "method.name", "optim"):
         with pytest.raises(ValueError, match=name.split(".")[-1]):
             changed(run, {name: 3})

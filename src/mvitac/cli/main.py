@@ -49,7 +49,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if "OMP_WAIT_POLICY" not in os.environ:
         # Beside another busy program, threads that wait by spinning made a step take five times as long (docs/speed.md).
         os.environ.setdefault("GOMP_SPINCOUNT", "10000")
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    words = sys.argv[1:] if argv is None else argv
+    home = f"={Path.home()}/"  # the shell does not read ~ in --out=~/x
+    arguments = [word.replace("=~/", home, 1) if word.startswith("--") else word for word in words]
     try:
         return _run(arguments)
     except KeyboardInterrupt:
@@ -60,8 +62,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except (ValueError, OSError, MemoryError) as error:
         text = " ".join(str(error).split()) or type(error).__name__
-        if arguments[0] == "data":  # here the options of a dataset are --path, not --data.path as for pretrain
-            text = text.replace("--data.", "--")
+        if arguments[0] not in HEAVY:  # here the options of a dataset are --path, not --data.path as for pretrain
+            where = "" if arguments[0] == "data" else " of mvitac data pack"
+            text = re.sub(r"--data\.([\w-]+)", rf"--\1{where}", text)
         print(f"mvitac: error: {text}", file=sys.stderr)
         return 2
     except Exception as error:

@@ -91,7 +91,11 @@ class DatasetConfig(Registered):
 
         It is built in the cache (``files.cache_dir``) if it does not exist, and again if files of the dataset have changed.
         """
-        return windowed(self._frames(quiet), self.frame_window())
+        pack = self._frames(quiet)
+        try:
+            return windowed(pack, self.frame_window())
+        except ValueError as error:  # nobody knows the cache's folder
+            raise ValueError(str(error).replace(str(pack.path), str(getattr(self, "path", self.name)))) from None
 
     def _frames(self, quiet: bool) -> Pack:
         source = self.source()

@@ -71,7 +71,7 @@ REPAIRS = {
 
 def repaired(name: bytes | str) -> str:
     """Return the name in an attribute object_name, repaired."""
-    text = (name.decode() if isinstance(name, bytes) else str(name)).strip(" \0\n\r\t")
+    text = (name if isinstance(name, bytes) else str(name).encode()).decode().strip(" \0\n\r\t")
     if not text:
         raise ValueError("object_name is empty")
     return REPAIRS.get(text, text)

@@ -81,4 +81,8 @@ def _constants(root: Path) -> dict[str, Any]:
         raise ValueError(f"{file} cannot be read as labels ({brief(error)})") from None
     for name in sorted(wanted - found.keys()):
         raise ValueError(f"{file} does not define {name}: check out the version the paper was published with")
+    for name, value in found.items():
+        kind = dict if name in LABELS.values() else list
+        if not isinstance(value, kind) or not all(isinstance(each, str) for each in value):
+            raise ValueError(f"{file}: {name} is no {kind.__name__} of names of objects")
     return found

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+from mvitac.data.stamps import number_of
 from mvitac.datasets.table.manifest import Manifest, in_clone
 from mvitac.datasets.table.splits import add_folds
 from mvitac.datasets.table.table import RowsConfig
@@ -45,18 +46,22 @@ class SlipGraspConfig(RowsConfig):
         rows = [row for file in sorted(root.glob("object*_result.dat")) for row in _grasps(root, file)]
         objects = [row["object"] for row in rows]
         add_folds(rows, objects, len(set(objects)), val_every=1)
-        return Manifest.of(root, rows)
+        bare = [each.name for each in sorted(root.glob("object*")) if not each.suffix and each.name[6:] not in objects]
+        notes = (f"{name} is left out: {name}_result.dat says nothing of it" for name in bare)
+        return Manifest.of(root, rows, notes=tuple(notes))
 
 
 def _grasps(root: Path, file: Path) -> list[dict[str, str]]:
     name = file.name[len("object") : -len("_result.dat")]
     rows: list[dict[str, str]] = []
     widths: dict[str, float] = {}
-    for number, line in enumerate(file.read_text().splitlines(), 1):
+    for number, line in enumerate(file.read_text(encoding="utf-8-sig", errors="replace").splitlines(), 1):
         words = line.split()
         if not words:
             continue
-        if len(words) != 8 or words[2] not in ("0", "1") or "/" in words[6]:  # the folder, which is one of the object's
+        # The seventh is a folder of the object's own.
+        numbers = [number_of(words[i]) for i in (0, 5)] if len(words) == 8 and "/" not in words[6] else [None]
+        if None in numbers or words[2] not in ("0", "1") or not words[5].isdecimal():
             raise ValueError(f"{file} line {number}: {line!r} is not a grasp of eight words")
         width, _, success, _, _, key, folder, _ = words
         pairs: dict[int, dict[str, str]] = defaultdict(dict)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import version
 from typing import Any, ClassVar
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -21,7 +22,9 @@ from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec
 from mvitac.datasets.simulated import LICENCE, PressConfig, value_task
 from mvitac.sim import ball, measured
+from mvitac.sim.measured import BALL_MM, MM
 from mvitac.sim.sensors import MEASURED
+from mvitac.system.files import brief
 
 VERSION = 1
 TASKS = {"place": ("contact_x_mm", "contact_y_mm"), "radius": ("radius_mm",), "depth": ("depth_mm",)}
@@ -100,15 +103,26 @@ class Taxim(Source):
 @cache
 def _pack(make: str) -> dict[str, np.ndarray]:
     """The arrays of one sensor, with images in RGB and cut to the middle: imgs [N, 480, 480, 3], f0 [480, 480, 3]."""
-    with np.load(measured.folder(make) / "dataPack.npz") as file:
-        images = {name: np.ascontiguousarray(file[name][..., 80:560, ::-1]) for name in ("imgs", "f0")}
-        return images | {name: file[name].astype(float) for name in ("touch_center", "touch_radius")}
+    file = measured.folder(make) / "dataPack.npz"
+    try:
+        with file.open("rb") as opened, np.load(opened) as pack:
+            images = {name: np.ascontiguousarray(pack[name][..., 80:560, ::-1]) for name in ("imgs", "f0")}
+            centre, radius = (pack[name].astype(float) for name in ("touch_center", "touch_radius"))
+        if not images["imgs"].shape == (len(radius), 480, 480, 3) == (len(centre), *images["f0"].shape) or not len(
+            radius
+        ):
+            raise ValueError("as many images as circles")
+        if not ((centre >= 0) & (centre < (640, 480)) & (radius > 0)[:, None]).all() or radius.max() >= BALL_MM / MM:
+            raise ValueError("a circle that the ball can leave in the frame")
+    except (OSError, EOFError, LookupError, ValueError, BadZipFile) as error:
+        raise ValueError(f"{file} is damaged ({brief(error)}): install taxim again") from None
+    return images | {"touch_center": centre, "touch_radius": radius}
 
 
 def _frame(make: str, i: int) -> dict[str, Any]:
     pack, mini = _pack(make), make == "gelsight_mini"
-    x, y = (pack["touch_center"][i] - (319.5, 239.5)) * measured.MM
-    radius = float(pack["touch_radius"][i] * measured.MM)
+    x, y = (pack["touch_center"][i] - (319.5, 239.5)) * MM
+    radius = float(pack["touch_radius"][i] * MM)
     press = max(start for start in MINI_PRESSES if start <= i) if mini else i
     known = {"contact_x_mm": float(x), "contact_y_mm": float(y), "radius_mm": radius}
     known["depth_mm"] = math.nan if mini else ball.depth_mm(radius)

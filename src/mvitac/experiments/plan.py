@@ -69,7 +69,10 @@ class Plan:
         labels = [row.label for row in self.rows]
         check_range(self, 1, 1000, "seeds")
         fixed = {"seed": "runs have the seeds 0 .. seeds - 1, give their number", "device": "give --device instead"}
-        for name in (name for each in (self.set, *(row.set for row in self.rows)) for name in each if name in fixed):
+        fixed |= {"recipe": "give --recipe, or recipe beside rows in the plan", "method": "a row of the plan names it"}
+        fixed |= {"data.score_on": "rows are scored on the same samples, give --data.score-on"}
+        given = {name for each in (self.set, *(row.set for row in self.rows)) for name, _ in dotted(each)}
+        for name in fixed.keys() & given:
             raise ValueError(f"{name}: {fixed[name]}")
         if not all(slug(label) for label in labels):
             raise ValueError(f"plan {self.name!r}: a row has no label of letters or digits")
@@ -160,6 +163,8 @@ def changed(run: Run, changes: Mapping[str, Any]) -> Run:
         if name in ("method.name", "data.name") or not isinstance(inner, dict):
             raise ValueError(f"{name} is no field that can be changed")
         inner[last] = list(new) if isinstance(new, tuple) else new
+    if "epochs" in whole and "steps" not in whole:  # of a recipe: with them epochs would be ignored
+        value["steps"] = None
     return Run.load(value)
 
 

@@ -11,7 +11,7 @@ import os
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -52,18 +52,22 @@ class Manifest:
 
     @classmethod
     def of(
-        cls, path: Path, rows: Sequence[Row], images: dict[str, list[ImageRef | None]] | None = None, **known: Any
+        cls,
+        path: Path,
+        rows: Iterable[Mapping[str, Any]],
+        images: dict[str, list[ImageRef | None]] | None = None,
+        **known: Any,
     ) -> "Manifest":
         """Return the table of ``rows`` that a reader made from ``path``; cells that a row lacks are empty.
 
-        ``text_of`` makes texts of other values. ``images`` and ``known`` are other fields of the table.
+        Cells that are no text become one by ``text_of``. ``images`` and ``known`` are other fields of the table.
         """
-        if not rows:
+        if not (rows := [*rows]):
             raise ValueError(f"{path} holds no rows: is it the right one, and whole?")
         for column in (column for column, refs in (images or {}).items() if len(refs) != len(rows)):
             raise ValueError(f"{path}: column {column!r} has {len((images or {})[column])} images for {len(rows)} rows")
         names = dict.fromkeys(name for row in rows for name in row)
-        rows = [{name: row.get(name, "") for name in names} for row in rows]
+        rows = [{name: c if isinstance(c := row.get(name), str) else text_of(c) for name in names} for row in rows]
         where = {c: [str(ref).removeprefix(str(path)) for ref in refs] for c, refs in (images or {}).items()}
         known.setdefault("digest", digest([rows, where] if where else rows))
         return cls(path, rows, numbers=range(1, len(rows) + 1), images=images or {}, **known)

@@ -42,7 +42,7 @@ class Frame:
 def read_list(file: Path, num_classes: int) -> list[tuple[str, int, int]]:
     """Return (recording, frame, label) per row, -1 = inconclusive; ValueError names an invalid line."""
     try:
-        text = file.read_text(encoding="utf-8")
+        text = file.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise ValueError(f"{file} is not text: give the owners' list file") from None
     found = ROW.findall(text)
