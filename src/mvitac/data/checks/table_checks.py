@@ -102,17 +102,12 @@ def leaks(pack: Pack) -> list[Finding]:
     return findings
 
 
-def ungrouped(pack: Pack) -> list[Finding]:
-    """Repeat the note of a table that was packed without groups; [] with groups."""
-    notes = [note for note in pack.spec.notes if UNGROUPED in note]
-    return [judged("groups", "; ".join(notes), "pack again with --group COLUMN")] if notes else []
-
-
-def shared_by_parts(pack: Pack) -> list[Finding]:
-    """Repeat the note of a mix on what train of one part and test of another have in common; [] if nothing."""
-    notes = [note for note in pack.spec.notes if SHARED in note]
+def noted(pack: Pack) -> list[Finding]:
+    """Repeat notes of a table without groups, and of a mix where train of one part and test of another share something."""
+    notes = {mark: "; ".join(note for note in pack.spec.notes if mark in note) for mark in (UNGROUPED, SHARED)}
     advice = "pack them with splits that agree, or leave a part out"
-    return [judged("shared by parts", "; ".join(notes), advice, broken=True)] if notes else []
+    found = [judged("groups", notes[UNGROUPED], "pack again with --group COLUMN")] if notes[UNGROUPED] else []
+    return found + ([judged("shared by parts", notes[SHARED], advice, broken=True)] if notes[SHARED] else [])
 
 
 def _predicts(what: str, task: str, values: np.ndarray, labels: np.ndarray) -> list[str]:
