@@ -163,7 +163,7 @@ def changed(run: Run, changes: Mapping[str, Any]) -> Run:
         if name in ("method.name", "data.name") or not isinstance(inner, dict):
             raise ValueError(f"{name} is no field that can be changed")
         inner[last] = list(new) if isinstance(new, tuple) else new
-    if "epochs" in whole and "steps" not in whole:  # of a recipe: with them epochs would be ignored
+    if [name for name in whole if name in ("steps", "epochs")][-1:] == ["epochs"]:  # beside steps it would be ignored
         value["steps"] = None
     return Run.load(value)
 
