@@ -11,6 +11,11 @@ shift 2
 options=("$@")
 [ -d "$out/manifests" ] || python "$(dirname "$0")/real_manifests.py" "$data" "$out/manifests"
 
+sets="slip_grasp vt60 slip_gsmini physiclear-by-group physiclear-owners_split"
+for name in ${SETS:-}; do
+  [[ " $sets " == *" $name "* ]] || { echo "SETS has no $name, only $sets" >&2; exit 2; }
+done
+
 # methods NAME PLAN BATCH OPTIONS...: make one table. BATCH is the power of two nearest to the number of grasps or
 # recordings in train, at most 64.
 methods() {

@@ -177,6 +177,8 @@ def test_python_functions(pack: Pack, functions: str) -> None:
     torch.testing.assert_close(tokens, (images.float() / 255).mean(1).flatten(1))
     with pytest.raises(ValueError, match="random weights are trained on nothing: leave trained-on out"):
         open_model("external:timm/test_resnet,weights=random,trained-on=ours")
+    with pytest.raises(ValueError, match=r"unknown option of external:timm 'place': choose from .*, trained-on"):
+        open_model("external:timm/test_resnet,weights=random,place=resnet18")
     with pytest.raises(ValueError, match="NaN or infinite features of touch"):
         open_model(f"{functions}nan").on(pack)[0].features("touch", images)
     with pytest.raises(ValueError, match="batch: features of touch depend on the other images, or on chance"):
@@ -220,7 +222,7 @@ def test_windows_are_opened_where_the_data_has_an_order(pack: Pack, tmp_path: Pa
         ("external:timm/resnet19,weights=random", "unknown trunk 'resnet19'"),
         ("external:timm/vit_base_patch16_clip_224.openai", "clip_quickgelu_224.openai"),
         (f"{TINY},seed=1,seed=2", "an option is given twice"),
-        (f"{TINY},sice=32", "unknown field.*'sice'.*'size'"),
+        (f"{TINY},sice=32", "unknown option.*'sice'.*'size'"),
         (TINY.replace("size=32", "size=0"), "or less"),
         (f"{TINY},seed=one", "seed: expected int"),
     ],

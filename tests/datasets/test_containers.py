@@ -198,6 +198,10 @@ def test_lerobot_says_what_is_missing(tmp_path: Path) -> None:
     refused(root, r"file-001\.mp4 is missing: fetch the videos too")
     (root / "data/chunk-000/file-001.parquet").write_text("no")
     refused(root, r"file-001\.parquet cannot be read as a table")
+    (file := root / "data/chunk-000/file-000.parquet").write_bytes(
+        file.read_bytes().replace(b"frame_inde", b"frame_ind\xc7")
+    )
+    refused(root, r"file-000\.parquet cannot be read as a table")
 
 
 def changed(

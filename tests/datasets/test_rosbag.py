@@ -109,7 +109,9 @@ def test_clocks_that_pair_nothing(tmp_path: Path, gel: list[float], front: list[
         with pytest.raises(ValueError, match=says):
             config.source()
     else:
-        assert f"1 messages of {GEL} have the stamp of another" in config.manifest().notes[0]
+        table = config.manifest()
+        assert f"1 messages of {GEL} have the stamp of another" in table.notes[0]
+        assert [ref and ref.stamp - START * 10**9 for ref in table.images[GEL]] == [0, 1, 2]  # type: ignore[attr-defined]
         killed = tmp_path / "killed.bag.active"
         for file in (killed, tmp_path / "bag" / "bag.mcap"):
             killed.touch() if file == killed else killed.unlink()

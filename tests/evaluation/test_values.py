@@ -75,6 +75,18 @@ def test_the_interval_of_r2_holds_it_and_a_worse_method_is_told_apart() -> None:
     assert paired_difference(good[:1], bad[:1])[3] is None
 
 
+@pytest.mark.parametrize("still", [0.0, 0.1, 0.25])
+def test_one_group_that_moves_alone_gives_its_own_r2_and_no_interval(still: float) -> None:
+    """Without it the others have no spread, and R2 no sense."""
+    groups, rng = np.arange(48) // 6, np.random.default_rng(0)
+    y = np.where(groups == 0, rng.uniform(0, 3, 48), still)[:, None]
+    ours, theirs = ({**score_values(y, y + rng.normal(0, 1, y.shape), groups, NEWTON), "seed": 0} for _ in range(2))
+    mean, low, high = interval([ours])
+    assert mean == pytest.approx(ours["r2"]) and low == -np.inf and high > 0.99
+    difference, low, high, _ = paired_difference([ours], [theirs])
+    assert difference == pytest.approx(ours["r2"] - theirs["r2"]) and (low, high) == (-np.inf, np.inf)
+
+
 def test_error_by_range_finds_where_predictions_are_wrong() -> None:
     y = np.linspace(0, 8, 400)[:, None]
     record = score_values(y, np.minimum(y, 6), np.arange(400) % 4, NEWTON)  # saturates above 6 N

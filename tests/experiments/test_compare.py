@@ -188,6 +188,7 @@ def test_methods_of_these_plans_see_equally_many_images(pack: Pack, name: str) -
         ('reference = "a"\nset = {device = "cpu"}\n[[rows]]\nlabel = "a"', "device: give --device instead"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\nset = {recipe = "paper"}', "recipe: give --recipe"),
         ('reference = "a"\nset = {data.score_on = "val"}\n[[rows]]\nlabel = "a"', "give --data.score-on"),
+        (f'reference = "a"\n[[rows]]\nlabel = "{"é" * 100}"', "one of over 200 bytes"),
         ('reference = "pixels"\n[[rows]]\nlabel = "pixels"', "row 'pixels' has the name of a control"),
     ],
 )
@@ -209,9 +210,9 @@ def test_changed_fields_are_checked() -> None:
     assert changed(run, {"optim.lr": 1, "steps": 7}).optim.lr == 1.0
     assert changed(run, {"data.num_frames": 4}).data.num_frames == 4  # not written to files at its default
     assert changed(run, {}) == run and replace(TABLE1, set={"method": {"temperature": 0.2}}).set
-    assert (
-        run.steps and changed(run, {"epochs": 2}).steps is None and changed(run, {"epochs": 2, "steps": 5}).steps == 5
-    )
+    row = Row(label="MViTac", set={"epochs": 2})
+    assert run.steps and replace(TABLE1, set={"steps": 7}).run(row, MaterialsConfig(), 0).steps is None
+    assert changed(run, {"epochs": 2, "steps": 5}).steps == 5
     for name in ("optim.lrr", "steps.more", "nothing", "method.name", "optim"):
         with pytest.raises(ValueError, match=name.split(".")[-1]):
             changed(run, {name: 3})

@@ -82,6 +82,19 @@ def test_damaged_frames_are_left_out(engine: Engine, films: dict[str, Path], tmp
     assert table["time"][3] == pytest.approx(4 / 25) and table["contact"].sum() == NUM - FREE
     ((text, first),) = hurt.told.items()
     assert "3.png" in text and first == 3
+    early = LiveConfig(calibration=FREE + 5)
+    told = Recordings(engine, opened(films) | {"touch": [recording(f"{tmp_path}@25")]}, early).told
+    assert told["touch 0 was touched or moved: contact is learned from later frames, or give --background"] == FREE + 5
+
+
+def test_pictures_named_by_their_time_are_at_it(tmp_path: Path) -> None:
+    for time in (1_700_000_000.25, 1_700_000_000.5, 1_700_000_020):
+        Image.new("RGB", (8, 8)).save(tmp_path / f"{time}.png")
+    stamped = recording(str(tmp_path))
+    assert (stamped.times - 1_700_000_000).tolist() == [0.25, 0.5, 20] and stamped.fps == pytest.approx(2 / 19.75)
+    assert recording(f"{tmp_path}@5").times.tolist() == [0, 0.2, 0.4]
+    (tmp_path / "1.png").write_bytes(b"")
+    assert recording(str(tmp_path)).times[1] == 1 / 30
 
 
 def test_names_of_ours_and_of_others_are_not_taken(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,14 +169,14 @@ def test_predict_command(
     assert one.column("pattern.rows").to_pylist() == pytest.approx(row.column("pattern.rows").to_pylist(), abs=1e-5)
     assert "split" in row.column_names and not {"group", "split"} & {*one.column_names}  # made up for a new table
     assert "warning" not in capsys.readouterr().err
-    (tmp_path / "some.csv").write_text("vision,touch\nvision.png,touch.png\n,touch.png\n")
+    (tmp_path / "some.csv").write_text("vision,touch,sensor\nvision.png,touch.png,new\n,touch.png,new\n")
     crop: Any = {"crop": ("touch=0:0:16:16",), "allow_missing": True, "allow_leak": True}
     some = FolderConfig(path=tmp_path / "some.csv", size=32, **crop).source()
     for side in (32, 16):
         build(some, tmp_path / f"some{side}", size=side, quiet=True)
     assert main([*command, str(tmp_path / "some32"), "--out", str(out)]) == 0
     said = capsys.readouterr().err
-    assert "1 of 2 rows are left out" in said
+    assert "1 of 2 rows are left out" in said and "touch sensor new is new to the model, which knows" in said
     assert "touch shows 0:0:16:16, the model learned from whole images" in said
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for name, data in {

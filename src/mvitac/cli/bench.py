@@ -50,7 +50,7 @@ class _CheckOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class _BoardOptions(_CheckOptions):
-    """Write one page that compares results of one suite: tasks down, encoders across, controls first."""
+    """Write one page that compares results of one suite: tasks down, encoders across, controls last."""
 
     out: Path = Path("board.html")
     """The page, one file without scripts."""

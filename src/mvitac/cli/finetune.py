@@ -35,15 +35,13 @@ def finetune(argv: list[str]) -> None:
     names = "|".join(DatasetConfig.choices)
     if "--data" not in chosen and not asks_help(rest):
         raise ValueError(f"name the data: --data {names}")
-    usual = _Options(model=Path("MODEL"), data=dataset(chosen.get("--data", "pack")))
+    usual = _Options(model=tyro.MISSING, data=dataset(chosen.get("--data", "pack")))
     about = f"""Train a model's encoders with labels. Settings are chosen on held-out groups of train. Training from random
     weights and a linear probe on the frozen encoders get the same labels.
 
       --data {names}  (required; or a path)
     """
     options = parse(_Options, rest, "finetune", default=usual, description=about)
-    if options.model == usual.model:
-        raise ValueError("name the model: the folder of a run or an artifact, or imagenet (see mvitac finetune --help)")
     given = options.model, options.data, options.config, options.out
     result = run_finetune(*given, resume=options.resume, quiet=options.quiet)
     print_finetuning(result)

@@ -105,8 +105,7 @@ def live(argv: list[str]) -> None:
     if not (options.vision or options.touch):
         _say("no --vision, no --touch: all sensors are simulated")
     sensor = options.sensor or next((stream.origin.sensor for stream in streams.get("touch", ())), "")
-    if about := about_sensor(engine, sensor):
-        _say(about)
+    _say_sensors(engine, (sensor,))
     more: Any = {"tell": lambda event: _say(event.text), "free": free, "always": options.always}
     loop, recorder = Live(engine, streams, options.live, **more), None
     if options.record:  # last, for a refusal must leave no spool
@@ -194,11 +193,13 @@ def predict(argv: list[str]) -> None:
         for m in [m for m in engine.inputs if pack.spec.crop.get(m) != engine.crop.get(m)]:
             have, wanted = (crop.get(m, "whole images") for crop in (pack.spec.crop, engine.crop))
             _say(f"mvitac: warning: {m} shows {have}, the model learned from {wanted}: pack it with --crop")
+        _say_sensors(engine, pack.column("sensor") if "sensor" in pack.table.column_names else ("",))
         about = ("group", "split") if isinstance(config, PackConfig) else ()  # those of a new table mean nothing
         if num := pack.num - _write(options.out, pack_tables(engine, pack, about), pack.num):
             _say(f"{num} of {pack.num} rows are left out: without an image that the model takes")
         return
     opened = dict.fromkeys(engine.inputs, single) if single else opened
+    _say_sensors(engine, ("",))
     _say_uncropped(engine, dict.fromkeys(engine.inputs, (options.source,)) if single else given)
     recordings = Recordings(engine, opened, options.live, options.free())
     try:
@@ -308,6 +309,11 @@ def _say_uncropped(engine: Engine, given: Mapping[str, Sequence[str | None]]) ->
         if any("#" not in f"{text}" and not f"{text}".startswith("sim") for text in given.get(m, ())):
             how = "add that to SOURCE, #x:y:width:height"
             _say(f"mvitac: warning: {m} is used whole, the model learned from {part}: {how}")
+
+
+def _say_sensors(engine: Engine, names: Iterable[str]) -> None:
+    for about in sorted({about_sensor(engine, name) for name in names} - {""}):
+        _say(about)
 
 
 def _say(text: str) -> None:

@@ -3,7 +3,7 @@
 import contextlib
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from datetime import datetime, timezone
 
 import numpy as np
@@ -28,6 +28,12 @@ def in_order(names: Iterable[str]) -> list[str]:
     if all(number_of(name) is not None for name in names):
         return sorted(names, key=float)
     return sorted(names, key=lambda name: [int(n) if n.isdecimal() else n for n in re.split(r"(\d+)", name)])
+
+
+def stamped(names: Sequence[str]) -> np.ndarray | None:
+    """Return the times [N] in seconds of images named by stamps since 1970; None of other names, as of those that count."""
+    times = seconds(names, "names") if all(number_of(name) is not None for name in names) else np.zeros(1)
+    return times if times.min() > 1e9 else None
 
 
 def seconds(cells: Iterable[str], where: object) -> np.ndarray:

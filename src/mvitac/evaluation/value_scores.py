@@ -68,11 +68,18 @@ def one_target(record: dict[str, Any], t: int) -> dict[str, Any]:
     return {**record, "r2": target["r2"], "targets": [target], "group_sums": sums, **points}
 
 
-def r_squared(sums: dict[str, Any]) -> Any:
-    """R2 from ``SUMS`` (numbers or arrays): 1 - squared error / squared deviation from the mean of the same rows."""
-    spread = sums["squared_value"] - sums["value"] ** 2 / np.maximum(sums["n"], 1)
+def r_squared(sums: dict[str, Any], of: dict[str, Any] | None = None) -> Any:
+    """R2 from ``SUMS`` (numbers or arrays): 1 - squared error / squared deviation from the mean of the same rows.
+
+    Of a part, the deviation counts as at least a millionth of that of all rows, ``of``: it may be none.
+    """
     least = np.finfo(float).eps * sums["squared_value"] + 1e-130  # less is rounding
-    return 1 - sums["squared_error"] / np.maximum(spread, least)
+    least = least if of is None else np.maximum(least, 1e-6 * _spread(of))
+    return 1 - sums["squared_error"] / np.maximum(_spread(sums), least)
+
+
+def _spread(sums: dict[str, Any]) -> Any:
+    return sums["squared_value"] - sums["value"] ** 2 / np.maximum(sums["n"], 1)
 
 
 def error_by_range(true: np.ndarray, error: np.ndarray, num: int = NUM_RANGES) -> list[dict[str, float]]:
@@ -91,4 +98,5 @@ def error_by_range(true: np.ndarray, error: np.ndarray, num: int = NUM_RANGES) -
 def r2_without_each_group(record: dict[str, Any]) -> np.ndarray:
     """R2, mean over targets, of the rows outside group 0, 1, ...: [G]."""
     sums = {name: np.array(record["group_sums"][name], float) for name in SUMS}  # [T, G]
-    return r_squared({name: each.sum(1, keepdims=True) - each for name, each in sums.items()}).mean(0)
+    whole = {name: each.sum(1, keepdims=True) for name, each in sums.items()}
+    return r_squared({name: whole[name] - each for name, each in sums.items()}, whole).mean(0)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from mvitac.data.images import IMAGES, decode
-from mvitac.data.stamps import in_order
+from mvitac.data.stamps import in_order, stamped
 from mvitac.data.video import VIDEOS, frames
 from mvitac.sim.sensors import SENSORS
 from mvitac.system.files import brief
@@ -106,6 +106,10 @@ class Recording(Source):
         """Time of the frame that was read last."""
         return float(self.times[max(0, self.number)])
 
+    def _timed(self, times: np.ndarray) -> None:
+        self.times, seconds = times, float(np.ptp(times))
+        self.fps = (len(times) - 1) / seconds if seconds else 30.0
+
     def read(self) -> np.ndarray:
         if self.number + 1 >= len(self.times):
             raise Ended
@@ -127,9 +131,7 @@ class Video(Recording):
         if self.number < 0:
             from mvitac.datasets.table.clocks import times_of  # robots that read no video have no pyarrow
 
-            self.times = times_of(self.path)
-            seconds = float(np.ptp(self.times))
-            self.fps = (len(self.times) - 1) / seconds if seconds else 30.0
+            self._timed(times_of(self.path))
         self.number, self.lost = -1, {}
         self.left = frames(self.path, range(len(self.times)), lost=self.lost)
         self.next = next(self.left, None)
@@ -142,10 +144,10 @@ class Video(Recording):
 
 
 class Folder(Recording):
-    """The pictures of a folder, in the order in which ``mvitac data pack`` reads them."""
+    """The pictures of a folder, in the order in which ``mvitac data pack`` reads them, and without ``fps`` at its times."""
 
-    def __init__(self, path: Path, fps: float = 30.0) -> None:
-        self.path, self.fps = path, fps
+    def __init__(self, path: Path, fps: float | None = None) -> None:
+        self.path, self.rate = path, fps
 
     def open(self) -> None:
         files = sorted(p for p in self.path.iterdir() if p.suffix.lower() in IMAGES)
@@ -153,7 +155,9 @@ class Folder(Recording):
         self.files = sorted(files, key=lambda file: place[file.stem])
         if not self.files:
             raise OSError(f"{self.path} holds no pictures ({', '.join(IMAGES)})")
-        self.times, self.number = np.arange(len(self.files)) / self.fps, -1
+        times = None if self.rate else stamped([file.stem for file in self.files])
+        self._timed(np.arange(len(self.files)) / (self.rate or 30.0) if times is None else times)
+        self.number = -1
 
     def image(self, number: int) -> np.ndarray:
         return np.array(decode(self.files[number], self.files[number].name))
@@ -232,10 +236,10 @@ def source(text: str, modality: str) -> Source:
     return found
 
 
-def _place(text: str) -> tuple[Path, float]:
+def _place(text: str) -> tuple[Path, float | None]:
     name, _, rate = text.rpartition("@")
     if not (name and Path(name).is_dir()):
-        return Path(text), 30.0
+        return Path(text), None
     if not re.fullmatch(r"\d*\.?\d+", rate) or not float(rate):
         raise ValueError(f"source {text!r}: {rate!r} is no frame rate")
     return Path(name), float(rate)

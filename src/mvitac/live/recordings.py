@@ -123,6 +123,9 @@ class Recordings:
         while contact.background is None and file.number + 1 < len(file.times):
             if (image := self._take(name, file)) is not None:
                 contact(image)
+                if contact.uneasy:
+                    text = f"{name} was touched or moved: contact is learned from later frames, or give --background"
+                    self.told.setdefault(text, file.number)
         file.open()
         return contact.background is not None
 

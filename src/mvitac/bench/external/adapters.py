@@ -20,7 +20,7 @@ import sys
 import uuid
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -34,7 +34,7 @@ from torch import Tensor, nn
 from mvitac.nn import imagenet
 from mvitac.nn.encoders import IMAGENET, SCRATCH, EncoderConfig, build_trunk, within
 from mvitac.nn.weights import said_trained_on
-from mvitac.registry import from_json, to_json, unknown
+from mvitac.registry import check_known, from_json, to_json, unknown
 from mvitac.system.files import brief
 
 START = "external:"
@@ -200,6 +200,8 @@ def parse(text: str) -> Adapter:
     kind = {"timm": Timm, "python": Python}.get(name)
     if not kind or not place:
         raise unknown("encoder", text, [f"{START}timm/NAME", f"{START}python:MODULE:FUNCTION"])
+    options = [field.name.replace("_", "-") for field in fields(kind) if field.name != "place"]
+    check_known(f"option of {START}{name}", [pair.partition("=")[0] for pair in pairs], options)
     given: dict[str, Any] = {key.replace("-", "_"): value for key, _, value in (pair.partition("=") for pair in pairs)}
     if len(given) < len(pairs):
         raise ValueError(f"{text}: an option is given twice")

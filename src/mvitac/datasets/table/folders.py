@@ -11,7 +11,7 @@ import numpy as np
 
 from mvitac.data.images import IMAGES
 from mvitac.data.pack_table import SPLITS
-from mvitac.data.stamps import in_order, number_of, seconds
+from mvitac.data.stamps import in_order, stamped
 from mvitac.data.video import VIDEOS
 from mvitac.datasets.table.clocks import nearest, times_of
 from mvitac.datasets.table.image_refs import Frame, ImageRef
@@ -53,11 +53,9 @@ def _split_rows(root: Path, split: str, plain: str, every: int) -> list[Row]:
     flat = [key for key in keys if "/" not in key]
     if flat and len(flat) < len(keys):
         raise ValueError(f"{base}: {flat[0]}.* is not in a class folder: put it in one, named by its class")
-    numbered = bool(flat) and all(number_of(key) is not None for key in flat)
     if flat:
         keys = in_order(flat)
-    times = seconds(keys, base) if numbered else np.zeros(1)
-    stamped = times.min() > 1e9  # since 1970; smaller numbers count the images
+    times = stamped(keys) if flat else None
     rows = []
     for i, key in enumerate(keys):
         row = {n: images[key].relative_to(root).as_posix() if key in images else "" for n, images in found.items()}
@@ -68,7 +66,7 @@ def _split_rows(root: Path, split: str, plain: str, every: int) -> list[Row]:
         elif i % every:
             continue
         else:
-            row |= recording_row(base.resolve().name, i, float(times[i]) if stamped else None)
+            row |= recording_row(base.resolve().name, i, None if times is None else float(times[i]))
         rows.append({**row, **more})
     return rows
 

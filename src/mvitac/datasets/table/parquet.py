@@ -61,7 +61,7 @@ def add_file(
                 there = _there(opened, group, column, num)
                 cells = (ParquetCell(str(file), group, column, i) if there[i] else None for i in range(num))
                 found.setdefault(column, []).extend(cells)
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{file} cannot be read as a table: {brief(error)}") from None
 
 
