@@ -28,11 +28,6 @@ def batch(pack: Pack, num: int, modality: str = "touch") -> torch.Tensor:
     return torch.from_numpy(np.array(pack.images[modality][:num])).permute(0, 3, 1, 2)
 
 
-@pytest.fixture(scope="module")
-def model(smoke_run: Path) -> Model:
-    return mvitac.load(smoke_run)
-
-
 def test_loading_draws_nothing_from_the_callers_chance(smoke_run: Path) -> None:
     torch.manual_seed(5)
     expected = torch.rand(2)
@@ -95,9 +90,9 @@ def test_embed_takes_paths_arrays_tensors_and_pictures_alike(model: Model, pack:
     assert model.embed(touch=names)["touch"].shape == (2, 64)
 
 
-def test_floats_are_taken_as_levels_or_refused(artifact: Path, pack: Pack) -> None:
+def test_floats_are_taken_as_levels_or_refused(model: Model, pack: Pack) -> None:
     """Everywhere: floats in [0, 1] were taken for levels 0 to 255, which are all black."""
-    model, images = mvitac.load(artifact), batch(pack, 4)
+    images = batch(pack, 4)
     scaled, normalised = images / 255, (images / 255 - 0.45) / 0.22
     close = {"atol": 1e-4, "rtol": 1e-4}
     expected = model.features("touch", images)
@@ -191,9 +186,8 @@ def test_trunk_of_two_sensors_has_six_channels(tmp_path: Path) -> None:
         fresh(replace(model.run, method=CalandraConfig()), pack.spec, 32).trunk("touch")
 
 
-def test_models_can_be_copied_and_pickled(artifact: Path, pack: Pack) -> None:
+def test_models_can_be_copied_and_pickled(model: Model, pack: Pack) -> None:
     """scikit-learn and ``torch.multiprocessing`` do."""
-    model = mvitac.load(artifact)
     expected = model.predict(touch=pack.images["touch"][:3])
     for twin in (copy.deepcopy(model), pickle.loads(pickle.dumps(model))):
         assert repr(twin) == repr(model)

@@ -17,7 +17,6 @@ from sklearn.linear_model import LogisticRegression
 
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
-from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation import controls
 from mvitac.evaluation import features as features_module
 from mvitac.evaluation.classifiers import fit_knn, fit_linear, fit_papers
@@ -35,7 +34,7 @@ from mvitac.evaluation.run_names import names_of
 from mvitac.evaluation.score_text import verdicts
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import Model, fresh, load
-from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders
+from mvitac.nn.encoders import SCRATCH, EncoderConfig
 from mvitac.recipes import recipe, with_method
 from mvitac.report.report import open_runs
 from mvitac.report.tables import print_classes, print_retrieval, print_summary
@@ -44,12 +43,12 @@ from mvitac.system.files import read_json
 from mvitac.training import setup
 from mvitac.training.loop import train
 from support.toy import Toy, renumbered, toy_pack, with_columns
+from support.training_runs import smoke
 
 
 @pytest.fixture(scope="module")
 def runs(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    base = tmp_path_factory.mktemp("runs")
-    run = replace(recipe("smoke", PackConfig(path=pack.path)), steps=2, eval_every=0)
+    base, run = tmp_path_factory.mktemp("runs"), smoke(pack, steps=2, eval_every=0)
     return [train(replace(run, seed=seed), base / f"seed{seed}", quiet=True) for seed in (0, 1)]
 
 
@@ -193,8 +192,7 @@ def test_a_folded_network_is_used_only_where_it_is_the_same(
 
 
 def test_retrieval_of_the_untrained_is_chance(pack: Pack) -> None:
-    run = recipe("smoke", PackConfig(path=pack.path))
-    models = [fresh(replace(run, seed=seed), pack.spec, 32) for seed in (0, 1, 2)]
+    models = [fresh(smoke(pack, seed=seed), pack.spec, 32) for seed in (0, 1, 2)]
     assert len({model.weights_digest() for model in models}) == 3
     found = [r for model in models for r in cross_modal(model, pack)]
     assert len(found) == 6 and {r["num_groups"] for r in found} == {12}
@@ -211,21 +209,20 @@ def test_retrieval_needs_enough_groups_to_choose_from(result: dict, tmp_path: Pa
     groups[np.isin(groups, names[10:])] = names[0]
     ten = with_columns(ten, group=groups)
     assert len(set(groups[test])) == 10  # the best five of ten are half of them
-    assert cross_modal(fresh(recipe("smoke", PackConfig(path=ten.path)), ten.spec, ten.size), ten) == []
+    assert cross_modal(fresh(smoke(ten), ten.spec, ten.size), ten) == []
 
 
 def test_a_model_of_both_senses_is_probed_on_one(tmp_path: Path) -> None:
     """Twelve test groups, enough for retrieval, but nothing to find them in."""
     touch = toy_pack(tmp_path / "touch", vision_channels=0)
-    both = Toy().spec()
-    model = fresh(recipe("smoke", PackConfig(path=touch.path)), both, touch.size)
+    model = fresh(smoke(touch), Toy().spec(), touch.size)
     assert cross_modal(model, touch) == []
     found = probe_model(model, touch, touch.spec.tasks[:1], ["touch"], ["knn"])
     assert [r["modality"] for r in found] == ["touch"]
 
 
 def test_a_runs_own_classifier_answers_by_the_names_of_classes(pack: Pack) -> None:
-    model = fresh(replace(recipe("smoke", PackConfig(path=pack.path)), method=SupervisedConfig()), pack.spec, pack.size)
+    model = fresh(smoke(pack, method=SupervisedConfig()), pack.spec, pack.size)
 
     def own(*classes: str) -> list[dict]:
         other = renumbered(pack, *classes)
@@ -242,8 +239,7 @@ def test_a_runs_own_classifier_answers_by_the_names_of_classes(pack: Pack) -> No
 def test_runs_of_other_data_and_settings_are_no_seeds_of_one_another(runs: list[Path], tmp_path: Path) -> None:
     """Two temperatures are two lines, each by its folder; what the two seeds share is one."""
     other = toy_pack(tmp_path / "p", num=90)
-    run = replace(recipe("smoke", PackConfig(path=other.path)), steps=1)
-    path = train(run, tmp_path / "r", quiet=True)
+    path = train(smoke(other, steps=1), tmp_path / "r", quiet=True)
     with pytest.raises(ValueError, match="trained on different data"):
         probe_runs([runs[0], path], ProbeConfig())
     run = load(runs[0]).run
@@ -275,7 +271,7 @@ def test_classes_that_train_lacks_are_named_below_the_scores(runs: list[Path], p
 
 def test_seeds_whose_automatic_precision_differs_are_seeds_of_one_run(pack: Pack, tmp_path: Path) -> None:
     """Noise of the clock may give one seed bf16 and the next fp32."""
-    run, paths = replace(recipe("smoke", PackConfig(path=pack.path)), steps=1, precision="auto"), []
+    run, paths = smoke(pack, steps=1, precision="auto"), []
     for seed in (0, 1):
         with pytest.MonkeyPatch.context() as patch:
             found = Hardware(torch.device("cpu"), ("fp32", "bf16")[seed], "")
@@ -365,7 +361,7 @@ def test_a_thumbnail_is_the_mean_of_its_pixels_and_the_border_sees_nothing_of_th
 
 
 def test_frozen_trunks_are_imagenet_and_files_that_runs_started_from() -> None:
-    run = replace(recipe("smoke"), encoder=Encoders().changed(trunk="mvitac_tiny", weights=SCRATCH))
+    run = recipe("smoke")
     started = replace(run, encoder=run.encoder.changed(weights="b.pth"))
     found = frozen_trunks([run, started, started])
     assert [name for name, _ in found] == ["imagenet", "start"] and found[1][1].encoder == started.encoder
@@ -412,8 +408,8 @@ def test_the_scale_of_a_feature_does_not_matter_to_any_linear_probe() -> None:
 
 def test_an_untrained_trunk_stands_beside_every_modality_and_search() -> None:
     """Whatever the order of the runs, the control is of one that has all the others have."""
-    base = replace(recipe("smoke"), encoder=Encoders().changed(trunk="mvitac_tiny", weights=SCRATCH))
-    spec, again = Toy().spec(), replace(base, seed=1)
+    base, spec = recipe("smoke"), Toy().spec()
+    again = replace(base, seed=1)
     touch, vision = (replace(base, method=SupervisedConfig(modalities=(m,))) for m in ("touch", "vision"))
     apart = with_method(base, "simclr")  # both modalities, no space that they share
     for runs, starts in (
@@ -429,7 +425,7 @@ def test_an_untrained_trunk_stands_beside_every_modality_and_search() -> None:
 def test_the_untrained_trunk_is_of_the_runs_own_data(tmp_path: Path) -> None:
     """A classifier of ``bright`` and a method of pairs, probed on touch alone without that label."""
     pack = toy_pack(tmp_path / "p", num=60, vision_channels=0)
-    base = replace(recipe("smoke"), encoder=Encoders().changed(trunk="mvitac_tiny", weights=SCRATCH))
+    base = recipe("smoke")
     runs = [replace(base, method=SupervisedConfig(tasks=("bright",))), with_method(replace(base, seed=1), "ssvtp")]
     pack.spec, own = replace(pack.spec, tasks=pack.spec.tasks[:1]), Toy().spec()
     records, retrieval = controls_of(runs, pack, pack.spec.tasks, ["touch"], ["knn"], specs=[own, own])

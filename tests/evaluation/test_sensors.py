@@ -34,11 +34,6 @@ def others(tmp_path_factory: pytest.TempPathFactory) -> Pack:
     return build(altered(Toy(), change), tmp_path_factory.mktemp("others") / "pack", size=32, quiet=True)
 
 
-@pytest.fixture(scope="module")
-def model(smoke_run: Path) -> Model:
-    return load(smoke_run)
-
-
 def test_models_keep_sensors_of_their_training_rows(smoke_run: Path, pack: Pack, others: Pack, tmp_path: Path) -> None:
     """And those of the weights they start from, if it is touch that they take. Older files name none."""
     assert load(smoke_run).spec.sensors == ("toy",) and "sensors" not in repr(load(smoke_run))

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from mvitac.data.spec import DataSpec, Window
+from mvitac.data.spec import Window
 from mvitac.methods.base import Method, Views
 from mvitac.methods.ijepa import IJEPA, Blocks, IJEPAConfig, multi_block
 from mvitac.methods.mae import MAE, MAEConfig, split_patches
@@ -22,10 +22,6 @@ from support.toy import Toy
 
 GRID, SIDE = (4, 4), 8
 MASKED = {"mae": MAEConfig(), "ijepa": IJEPAConfig()}
-
-
-def spec(**changes: object) -> DataSpec:
-    return replace(Toy().spec(), **changes)  # type: ignore[arg-type]
 
 
 def cut(image: Tensor) -> np.ndarray:
@@ -62,13 +58,7 @@ def noisy(method: Method) -> Method:
     return method.eval()
 
 
-def numbers(method: Method, batch: Views) -> dict[str, float]:
-    return {name: value.item() for name, value in outcome(method, batch).items()}
-
-
-@pytest.mark.parametrize(
-    ("num", "ratio", "visible"), [(36, 0.75, 9), (196, 0.75, 49), (16, 0.4, 9), (4, 0.99, 1), (9, 0.01, 8)]
-)
+@pytest.mark.parametrize(("num", "ratio", "visible"), [(196, 0.75, 49), (16, 0.4, 9), (4, 0.99, 1), (9, 0.01, 8)])
 def test_as_many_patches_are_hidden_as_the_ratio_says(num: int, ratio: float, visible: int) -> None:
     seen, hidden = split_patches(row_uniform(torch.tensor(3), torch.arange(50), num, 0), ratio)
     assert seen.shape == (50, visible)
@@ -82,7 +72,7 @@ def test_mae_is_the_mean_squared_error_of_hidden_patches(pixel_norm: bool) -> No
     assert isinstance(method, MAE)
     batch = views(method, num=3)
     batch = replace(batch, seed=torch.tensor(11))
-    found, errors = numbers(method, batch), {"vision": [], "touch": []}
+    found, errors = outcome(method, batch), {"vision": [], "touch": []}
     split = {m: split_patches(row_uniform(batch.seed, batch.rows, 16, n), 0.75) for n, m in enumerate(method.trunks)}
     for i in range(3):
         seen = {m: seen_alone(method.trunks[m], batch.images[m][0][i], split[m][0][i]) for m in errors}
@@ -96,8 +86,8 @@ def test_mae_is_the_mean_squared_error_of_hidden_patches(pixel_norm: bool) -> No
                     target = (target - target.mean()) / math.sqrt(target.var(ddof=1) + 1e-6)
                 errors[m].append(((guess - target) ** 2).mean())
     for m, each in errors.items():
-        assert found[m] == pytest.approx(np.mean(each), rel=1e-4)
-    assert found["loss"] == pytest.approx(found["vision"] + found["touch"], rel=1e-5)
+        assert found[m].item() == pytest.approx(np.mean(each), rel=1e-4)
+    torch.testing.assert_close(found["loss"], found["vision"] + found["touch"])
 
 
 def rectangle(at: list[int], width: int) -> tuple[int, int]:
@@ -152,7 +142,7 @@ def test_ijepa_is_smooth_l1_to_the_teachers_normalised_tokens() -> None:
     method = noisy(build("ijepa", config=IJEPAConfig(target_scale=(0.1, 0.4))))
     assert isinstance(method, IJEPA)
     batch = replace(views(method, num=3), seed=torch.tensor(5))
-    found, errors = numbers(method, batch), {"vision": [], "touch": []}
+    found, errors = outcome(method, batch), {"vision": [], "touch": []}
     blocks = {m: method.blocks(batch, m) for m in errors}
     for i in range(3):
         context = {m: next(live(blocks[m], i)) for m in errors}
@@ -166,7 +156,7 @@ def test_ijepa_is_smooth_l1_to_the_teachers_normalised_tokens() -> None:
                 off = np.abs(guess - normal[block])
                 errors[m].append(np.where(off < 1, 0.5 * off**2, off - 0.5).mean())
     for m, each in errors.items():
-        assert found[m] == pytest.approx(np.mean(each), rel=1e-4)
+        assert found[m].item() == pytest.approx(np.mean(each), rel=1e-4)
 
 
 def test_the_teacher_follows_with_a_linear_momentum() -> None:
@@ -183,7 +173,7 @@ def test_the_teacher_follows_with_a_linear_momentum() -> None:
 @pytest.mark.parametrize("name", MASKED)
 def test_frames_are_channels(name: str) -> None:
     window = Window(frames=2, stride=1, of=("vision", "touch"))
-    config, seen, batch = MASKED[name], spec(window=window), views(build(name), num=4)
+    config, seen, batch = MASKED[name], replace(Toy().spec(), window=window), views(build(name), num=4)
     twice = Views(images={m: [v[0].repeat(1, 2, 1, 1)] for m, v in batch.images.items()}, labels={}, rows=batch.rows)
     stacked = config.build(seen, TINY_VIT)
     assert torch.isfinite(outcome(stacked, twice)["loss"])
@@ -195,11 +185,11 @@ def test_frames_are_channels(name: str) -> None:
 
 @pytest.mark.parametrize("name", MASKED)
 def test_other_trunks_and_views_of_one_patch_are_refused(name: str) -> None:
-    config, run = MASKED[name], recipe("smoke")
+    config, run, spec = MASKED[name], recipe("smoke"), Toy().spec()
     with pytest.raises(ValueError, match=f"method '{name}' needs a plain ViT, and trunk mvitac_tiny is a ResNet: give"):
-        config.build(spec(), TINY)
+        config.build(spec, TINY)
     with pytest.raises(ValueError, match="needs a plain ViT, and trunk mvitac_tiny is a ResNet"):
-        replace(run, method=config).check(spec(), 100, 72)
+        replace(run, method=config).check(spec, 100, 72)
     small = replace(run, method=config, encoder=TINY_VIT, augment=replace(run.augment, size=8))
     with pytest.raises(ValueError, match=r"8 px are a single patch .*--augment\.size 16 or more"):
-        small.check(spec(), 100, 72)
+        small.check(spec, 100, 72)

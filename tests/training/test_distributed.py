@@ -11,9 +11,7 @@ import torch
 
 from mvitac.data.pack import Pack
 from mvitac.methods.base import Method
-from mvitac.recipes import recipe
 from mvitac.system.distributed import World
-from mvitac.training.setup import check_divisible
 from mvitac.training.step import Step
 from support.distributed_steps import METHODS, build, main, run_of, third_step, three_steps
 from support.processes import begin
@@ -94,8 +92,3 @@ def test_batchnorm_over_gpus_keeps_the_activation_that_timm_puts_into_it() -> No
     Step(run_of("mvitac"), method, torch.device("cuda"), World(0, 2))  # what it converts stays on the CPU here
     assert any(isinstance(layer, torch.nn.SyncBatchNorm) for layer in trunk.modules())
     assert torch.equal(trunk(images), before)
-
-
-def test_a_batch_that_does_not_divide_is_named() -> None:
-    with pytest.raises(ValueError, match="batch_size 16 is not divisible by 3 processes: give a multiple of 3"):
-        check_divisible(recipe("smoke"), World(0, 3))

@@ -16,7 +16,9 @@ from mvitac.nn.encoders import Encoders, draws_random_numbers
 from mvitac.registry import default
 from mvitac.run import Optim, Run
 from mvitac.system import threads as system_threads
+from mvitac.system.distributed import World
 from mvitac.training.loop import train
+from mvitac.training.setup import check_divisible
 from mvitac.training.step import Step
 from support.small_methods import TINY_VIT, small
 from support.small_steps import RUN, assert_close, build, gradients, split, views
@@ -101,6 +103,8 @@ def test_gradient_caching_is_exact_with_batchnorm_and_dropout_chunk_by_chunk() -
 def test_impossible_steps_are_named(pack: Pack, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="chunk 5: give a divisor of batch_size 16"):
         replace(RUN, chunk=5)
+    with pytest.raises(ValueError, match="batch_size 16 is not divisible by 3 processes: give a multiple of 3"):
+        check_divisible(RUN, World(0, 3))
     with pytest.raises(ValueError, match="'supervised' supports neither several processes nor --chunk"):
         train(smoke(pack, chunk=4, method=SupervisedConfig()), tmp_path / "r", quiet=True)
 

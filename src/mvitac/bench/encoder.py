@@ -102,15 +102,9 @@ def describe(models: Sequence[Model], places: Sequence[str], about: About) -> di
     found = _of_external(model) if isinstance(model, ExternalModel) else _of_run(model, Path(places[0]))
     given = {key: value for key, value in vars(about).items() if value}
     # Of floats: the wrapper of an external network keeps a digest among its parameters.
-    weighted = {m: [p for p in t.parameters() if p.is_floating_point()] for m, t in model.encoders.items()}
-    return {
-        **found,
-        **given,
-        "size": max(model.image_sizes(m)[0] for m in model.encoders),
-        "seeds": seeds,
-        "weights": weights,
-        "parameters": {m: sum(p.numel() for p in own) for m, own in weighted.items()},
-    }
+    sizes = {m: sum(p.numel() for p in t.parameters() if p.is_floating_point()) for m, t in model.encoders.items()}
+    side = max(model.image_sizes(m)[0] for m in model.encoders)
+    return {**found, **given, "size": side, "seeds": seeds, "weights": weights, "parameters": sizes}
 
 
 def _of_external(model: ExternalModel) -> dict[str, Any]:

@@ -112,19 +112,14 @@ class Materials(Source):
         self.config = config
 
     def spec(self) -> DataSpec:
+        tasks = {"category": materials.CLASSES, "soft": ("hard", "soft"), "rough": ("smooth", "rough")}
+        contact = [value_task(task, CONTACT[task]) for task in CONTACT] * self.config.contact
         return DataSpec(
             name="materials",
             vision_channels=3,
             touch_channels=3,
-            tasks=(
-                Task(name="category", classes=materials.CLASSES),
-                Task(name="soft", classes=("hard", "soft")),
-                Task(name="rough", classes=("smooth", "rough")),
-            ),
-            values=(
-                value_task("force", ["force_n"]),
-                *([value_task(task, CONTACT[task]) for task in CONTACT] * self.config.contact),
-            ),
+            tasks=tuple(Task(name=name, classes=classes) for name, classes in tasks.items()),
+            values=(value_task("force", ["force_n"]), *contact),
             group_by="instance",
             licence=LICENCE,
             source=f"mvitac.sim.materials version {materials.VERSION}",
@@ -226,13 +221,7 @@ class Grasps(Source):
             vision = made.pop("vision")
             both = np.concatenate([made.pop("touch_left"), made.pop("touch_right")], axis=2)
             grasp_id = f"{obj:03d}-{index:04d}"
-            columns = {
-                "id": f"{grasp_id}-{made['phase']}",
-                "group": made["object"],
-                "touch_group": grasp_id,
-                "split": split,
-                "label_success": int(made.pop("success")),
-                **made,
-            }
+            known = {"id": f"{grasp_id}-{made['phase']}", "group": made["object"], "touch_group": grasp_id}
+            columns = {**known, "split": split, "label_success": int(made.pop("success")), **made}
             samples.append(Sample(vision=vision, touch=both, columns=columns))
         return samples

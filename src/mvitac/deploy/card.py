@@ -21,27 +21,21 @@ def card(model: Model, about: dict[str, Any]) -> str:
     if learned != {key: data[key] for key in learned}:
         sets = {"Encoders": learned, "Probes": data}
     licences = ", and ".join(dict.fromkeys(one["licence"] for one in sets.values()))
+    loader = jinja2.PackageLoader("mvitac", "deploy")
     pages = jinja2.Environment(
-        loader=jinja2.PackageLoader("mvitac", "deploy"),
-        finalize=_harmless,
-        undefined=jinja2.StrictUndefined,
-        keep_trailing_newline=True,
+        loader=loader, finalize=_harmless, undefined=jinja2.StrictUndefined, keep_trailing_newline=True
     )
     with fields_of("run.json"):
         text = pages.get_template("card.md.j2").render(
+            about,
             model=model,
             run=model.run,
-            learned=learned,
-            data=data,
             sets=sets,
             licence=json.dumps(f"weights: as their owner says; trained on data under: {licences}"),
-            scores=scores,
             tables=_tables(model, scores),
             names=dict.fromkeys(score_name(task) for task in scores["summary"].values()),
             leaks=list(dict.fromkeys(probe.info.leak for probe in model.probes.values() if probe.info.leak)),
             covered=covered(scores["group_by"], [{"source": "run", "seed": 0}]),
-            given=about["preprocessing"],
-            start=about["start"],
             listed=listed,
         )
     as_it_is = ("|", "license")  # tables and the front matter

@@ -91,16 +91,13 @@ def pool_retrieval(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return pooled
 
 
-Cell = tuple[str, str, str]  # (task, modality, source)
-
-
-def by_cell(records: Sequence[dict[str, Any]], probe: str) -> dict[Cell, list[dict[str, Any]]]:
-    """Records of ``probe`` grouped by cell.
+def by_cell(records: Sequence[dict[str, Any]], probe: str) -> dict[tuple[str, str, str], list[dict[str, Any]]]:
+    """Records of ``probe`` by task, modality and source.
 
     A source without that probe on a task (majority, pixels, the paper's probe of values) keeps its first one.
     """
     kept = {(record["source"], record["task"]): probe for record in records if record["probe"] == probe}
-    found: dict[Cell, list[dict[str, Any]]] = {}
+    found: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
     for record in records:
         if record["probe"] == kept.setdefault((record["source"], record["task"]), record["probe"]):
             found.setdefault((record["task"], record["modality"], record["source"]), []).append(record)

@@ -104,18 +104,10 @@ def _bench(seed: int, obj: int) -> physics.Bench:
 def _latents(thing: objects.Thing, patch: skin.Patch, plan: physics.Plan) -> dict[str, float]:
     """Return the inputs of the simulation, stored as columns of the pack."""
     low, high = thing.bounds
-    grip = (low + high) / 2 + plan.offset_m
-    return {
-        "mass_kg": thing.mass,
-        "friction": plan.friction,
-        "force_n": plan.force_n,
-        "offset_mm": 1000 * float(grip[1] - thing.center_of_mass[1]),
-        "height_mm": 1000 * float(grip[2] - thing.center_of_mass[2]),
-        "yaw_deg": float(np.rad2deg(plan.yaw)),
-        "peaks": float(patch.peaks),
-        "amplitude_mm": patch.amplitude_mm,
-        "softness": thing.softness,
-    }
+    _, along, above = (1000 * ((low + high) / 2 + plan.offset_m - thing.center_of_mass)).tolist()
+    known = {"mass_kg": thing.mass, "friction": plan.friction, "force_n": plan.force_n}
+    known |= {"offset_mm": along, "height_mm": above, "yaw_deg": float(np.rad2deg(plan.yaw))}
+    return {**known, "peaks": float(patch.peaks), "amplitude_mm": patch.amplitude_mm, "softness": thing.softness}
 
 
 def _pressed(

@@ -172,13 +172,10 @@ KINDS = tuple(_DRAW)  # shape kinds. Objects cycle through them, so that every s
 def make_thing(seed: int, index: int) -> Thing:
     rng, kind = np.random.default_rng([OBJECT_TAG, seed, index]), KINDS[index % len(KINDS)]
     parts = _DRAW[kind](rng)
-    return Thing(
-        name=f"{kind}_{index:03d}",
-        parts=parts,
-        finish=Finish(rng),
-        density=rng.uniform(*MASS_KG) / sum(part.volume() * part.density for part in parts),
-        softness=float(rng.choice([0.0, 0.0, rng.uniform(0.3, 1.0)])),
-    )
+    finish = Finish(rng)
+    density = rng.uniform(*MASS_KG) / sum(part.volume() * part.density for part in parts)
+    softness = float(rng.choice([0.0, 0.0, rng.uniform(0.3, 1.0)]))
+    return Thing(name=f"{kind}_{index:03d}", parts=parts, finish=finish, density=density, softness=softness)
 
 
 def scene(thing: Thing) -> str:

@@ -41,12 +41,7 @@ class SealedFolder:
         return given
 
 
-ARTIFACT = SealedFolder(
-    "artifact.json",
-    "mvitac-artifact",
-    2,
-    "mvitac publish",
-    required=frozenset(("model.safetensors", "run.json")),
-    optional=frozenset(("probes.safetensors", "trained_on.safetensors", "README.md")),
-)
+_REQUIRED = frozenset(("model.safetensors", "run.json"))
+_OPTIONAL = frozenset(("probes.safetensors", "trained_on.safetensors", "README.md"))
+ARTIFACT = SealedFolder("artifact.json", "mvitac-artifact", 2, "mvitac publish", _REQUIRED, _OPTIONAL)
 """What ``mvitac publish`` writes (``deploy.artifact``)."""

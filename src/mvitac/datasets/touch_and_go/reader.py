@@ -152,15 +152,10 @@ class TouchAndGo(Source):
 
 
 def _columns(frame: Frame, spec: DataSpec) -> dict[str, Any]:
-    columns = {
-        "id": f"{frame.recording}/{frame.number:010d}",
-        "group": frame.recording,
-        "touch_group": f"{frame.recording}/{frame.touch:010d}",
-        "split": frame.split,
-        "frame": frame.number,
-        "label_category": frame.category,
-        "label_soft": -1 if frame.category < 0 else int(frame.category in lists.SOFT),
-    }
+    group, number = frame.recording, frame.number
+    known = {"id": f"{group}/{number:010d}", "group": group, "touch_group": f"{group}/{frame.touch:010d}"}
+    soft = -1 if frame.category < 0 else int(frame.category in lists.SOFT)
+    columns = {**known, "split": frame.split, "frame": number, "label_category": frame.category, "label_soft": soft}
     for task in spec.tasks[2:]:
         columns |= {"label_rough": frame.rough, **({task.split: frame.split_rough} if task.split != "split" else {})}
     return columns
