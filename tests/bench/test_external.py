@@ -15,15 +15,14 @@ from mvitac.bench.external.adapters import Preprocessing
 from mvitac.bench.external.model import is_noncommercial, randomised
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
-from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import features
 from mvitac.evaluation.probe import probe_model
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.model import fresh
 from mvitac.nn.encoders import within
-from mvitac.recipes import recipe
 from support.toy import toy_pack
+from support.training_runs import smoke
 
 
 def test_frames_are_newest_first_and_the_oldest_is_repeated() -> None:
@@ -58,9 +57,8 @@ def test_random_weights_for_the_control_leave_the_encoder_as_it_is(weights: Path
 
 @pytest.mark.parametrize("pool", ["last", "stages"])
 def test_the_same_network_gives_the_same_features_as_in_a_run(pack: Pack, tmp_path: Path, pool: str) -> None:
-    run = recipe("smoke", PackConfig(path=pack.path))
-    run = replace(run, encoder=run.encoder.changed(trunk="test_resnet", pool=pool))
-    ours = fresh(replace(run, augment=replace(run.augment, size=32, whole=None)), pack.spec, pack.size)
+    run = smoke(pack)
+    ours = fresh(replace(run, encoder=run.encoder.changed(trunk="test_resnet", pool=pool)), pack.spec, pack.size)
     torch.save(within(ours.encoders["touch"]).state_dict(), tmp_path / "trunk.pth")
     text = f"external:timm/test_resnet,weights={tmp_path / 'trunk.pth'},size=32,pool={pool}"
     theirs, same = open_model(text).on(pack)
@@ -76,9 +74,8 @@ def test_load_gives_a_model_that_embeds_and_is_probed(pack: Pack) -> None:
     embedded = model.embed(touch=pack.images["touch"][ROWS])["touch"]
     np.testing.assert_allclose(embedded.numpy(), features(model, own, "touch", ROWS), atol=1e-5)
     found = probe_model(model, own, own.spec.tasks, ["touch", "both"], ["linear"])
-    assert {(r["task"], r["modality"]) for r in found} == {
-        (t.name, m) for t in own.spec.tasks for m in ("touch", "both")
-    }
+    asked = {(t.name, m) for t in own.spec.tasks for m in ("touch", "both")}
+    assert {(r["task"], r["modality"]) for r in found} == asked
     assert cross_modal(model, own) == []
     with pytest.raises(ValueError, match="has no run"):
         model.trunk("touch")
@@ -243,11 +240,8 @@ def test_probe_writes_what_is_needed_to_check_an_encoder(
     assert "theirs (NC)" in printed and "no commercial use" in printed.replace("\n", " ") and "LEAK?" in printed
     (described,) = result["encoders"]
     about = described["encoders"]["touch"]
-    assert (
-        about["licence"] == "CC-BY-NC-4.0"
-        and len(about["files"]["trunk.pth"]) == 64
-        and about["parameters"] == sum(p.numel() for p in timm.create_model("test_resnet", num_classes=0).parameters())
-    )
+    assert about["licence"] == "CC-BY-NC-4.0" and len(about["files"]["trunk.pth"]) == 64
+    assert about["parameters"] == sum(p.numel() for p in timm.create_model("test_resnet", num_classes=0).parameters())
     assert about["preprocessing"]["size"] == [32, 32] and described["encoder"] == encoder
     sources = {r["source"]: r.get("leak") for r in result["records"]}
     assert sources["theirs (NC)"] == "unknown" and sources["theirs, untrained"] == "" and "pixels" in sources

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from mvitac.cli.main import COMMANDS, help_file, main
+from mvitac.cli.main import COMMANDS, HELP, help_file, main
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -38,5 +38,6 @@ def test_help_imports_nothing_heavy() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
-def test_no_help_is_left_behind() -> None:
+def test_helps_and_the_list_are_of_the_commands() -> None:
     assert {path.stem for path in help_file("").parent.glob("*.txt")} == {name.replace(" ", "-") for name in COMMANDS}
+    assert all(f"  {name} " in HELP for name in COMMANDS) and all(len(line) <= 80 for line in HELP.splitlines())

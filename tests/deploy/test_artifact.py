@@ -39,6 +39,8 @@ def test_predicts_what_the_probe_scored(smoke_run: Path, artifact: Path, pack: P
     assert not any(module.training for module in model.modules())
     with pytest.raises(ValueError, match="4 of vision and 5 of touch are no pairs"):
         model.predict(vision=pack.images["vision"][:4], touch=images)
+    with pytest.raises(ValueError, match="has one set of weights: leave out 'best'"):
+        mvitac.load(artifact, which="best")
 
 
 def test_the_card_names_what_encoders_and_what_probes_learned_from(artifact: Path) -> None:
@@ -66,11 +68,6 @@ def test_the_part_of_images_is_that_of_the_data_of_the_probes(smoke_run: Path, p
     assert with_probes(load(smoke_run), with_columns(pack, spec=replace(pack.spec, crop=part))).spec.crop == part
     with pytest.raises(ValueError, match="has labelled rows of no task in train and test: leave --on out"):
         publish(smoke_run, tmp_path / "b", with_columns(pack, split=["train"] * pack.num), allow_leak=True)
-
-
-def test_an_artifact_has_one_set_of_weights(artifact: Path) -> None:
-    with pytest.raises(ValueError, match="has one set of weights: leave out 'best'"):
-        mvitac.load(artifact, which="best")
 
 
 def test_difference_images_are_told(smoke_run: Path, pack: Pack, tmp_path: Path) -> None:

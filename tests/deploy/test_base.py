@@ -31,12 +31,16 @@ def test_base_answers_offline_by_its_name(tmp_path: Path, monkeypatch: pytest.Mo
     assert named("base") == "base"  # what is here has the name
 
 
-def test_commands_know_base(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_know_base_and_a_report_of_it_is_not_in_the_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     found = parse(_ProbeOptions, ["base", "--tasks", "feel", "base"], "probe")
     assert found.runs == (BASE,) and found.config.tasks == ("feel", "base")
     start = read_start(replace(mvitac.recipe("locked"), init=mvitac.Init(path=Path("base"))).init)
     assert start is not None and set(start.model.encoders) == {"vision", "touch"}
+    monkeypatch.setattr("mvitac.report.report.write_report", lambda runs, out, **_: f"{runs[0]} in {out}")
+    assert main(["report", "base"]) == 0 and capsys.readouterr().out == f"written: {BASE} in runs/report\n"
 
 
 def test_base_is_exported_on_a_few_rows_and_only_if_it_can_be_used(
@@ -52,14 +56,6 @@ def test_base_is_exported_on_a_few_rows_and_only_if_it_can_be_used(
     model = mvitac.load("base")
     own_data(model, "", few=100)
     assert opened == [replace(model.run.data, num=100)]
-
-
-def test_a_report_of_base_is_not_in_the_package(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("mvitac.report.report.write_report", lambda runs, out, **_: f"{runs[0]} in {out}")
-    assert main(["report", "base"]) == 0 and capsys.readouterr().out == f"written: {BASE} in runs/report\n"
 
 
 def test_a_probe_of_base_writes_nothing_into_the_package(tmp_path: Path) -> None:

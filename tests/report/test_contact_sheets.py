@@ -18,17 +18,14 @@ def rows_of(pack: Pack, tiles: Sequence[contact_sheet.Tile]) -> list[int]:
     return [pack.column("id").tolist().index(caption.split()[0]) for _, caption in tiles]
 
 
-def test_every_class_is_there_and_spread_over_groups(pack: Pack) -> None:
+def test_every_class_is_there_and_spread_over_groups_or_else_every_group(pack: Pack) -> None:
     found = contact_sheet.samples(pack)
     assert [heading for heading, _ in found] == [f"{n}: 40 rows, 20 instances" for n in ("columns", "rows", "checks")]
     for label, (_, tiles) in enumerate(found):
         rows = rows_of(pack, tiles)
         assert (pack.column("label_pattern")[rows] == label).all()
         assert len(set(pack.column("group")[rows])) == len(rows) == 6
-
-
-def test_without_labels_every_group_is_a_class(pack: Pack) -> None:
-    *found, last = contact_sheet.samples(with_columns(pack, spec=replace(pack.spec, tasks=())))
+    *found, last = contact_sheet.samples(with_columns(pack, spec=replace(pack.spec, tasks=())))  # without labels
     assert len(found) == 40 and all(len(tiles) == 2 for _, tiles in found) and last == ("20 more are not shown", [])
 
 

@@ -142,7 +142,9 @@ def test_shows_every_score_of_the_probe(materials: Path, result: dict[str, Any])
             assert shown[task, source] == [cell_text(found, source, m) for m in columns_of(found)]
 
 
-def test_verdict_and_figures_carry_the_numbers(materials: Path, result: dict[str, Any]) -> None:
+def test_verdict_and_figures_carry_the_numbers_and_nothing_is_asked_of_the_network(
+    materials: Path, result: dict[str, Any]
+) -> None:
     page = Page((materials / "out" / "report.html").read_text())
     drawn = {path.name for path in (materials / "out" / "figures").iterdir()}
     assert {"probe-category.png", "loss.png", "confusion-soft.png"} <= drawn
@@ -150,10 +152,6 @@ def test_verdict_and_figures_carry_the_numbers(materials: Path, result: dict[str
     assert verdicts(result["summary"]["category"])[0].partition(": ")[2] in page.text.replace("\xa0", " ")
     for curve in ("parts of the loss", "effective rank", "linear probe, rough", "retrieval R@5"):
         assert curve in page.text
-
-
-def test_asks_nothing_of_the_network(materials: Path) -> None:
-    page = Page((materials / "out" / "report.html").read_text())
     assert "default-src 'none'; img-src data:" in str(page.all("meta"))
     assert not {"script", "link", "iframe", "object", "embed", "form"} & {tag for tag, _ in page.tags}
     for _, attributes in page.tags:

@@ -31,16 +31,12 @@ def run(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(smoke(pack, **changes), tmp_path_factory.mktemp("validation") / "run", quiet=True)
 
 
-def test_the_start_is_evaluated_first(pack: Pack, run: Path) -> None:
+def test_the_start_is_evaluated_first_and_the_best_weights_have_the_lowest_errors(pack: Pack, run: Path) -> None:
     settings, evaluations = mvitac.load(run).run, [entry for entry in log_of(run) if "eval" in entry]
     assert [entry["step"] for entry in evaluations] == [0, 2, 4, 6, 8]
     assert evaluations[0]["eval"] == validate(fresh(settings, pack.spec, pack.size), pack, settings)[0]
     assert set(LINEAR) < evaluations[0]["eval"].keys()
     assert [entry for entry in log_of(run) if "verdict" in entry] == evaluations[-1:]
-
-
-def test_the_best_weights_are_those_with_the_lowest_errors(pack: Pack, run: Path) -> None:
-    evaluations = [entry for entry in log_of(run) if "eval" in entry]
     logs = [[np.log(max(0.01, 1 - entry["eval"][name])) for name in LINEAR] for entry in evaluations]
     errors = [float(np.exp(np.mean(each))) for each in logs]  # geometric means
     best = evaluations[int(np.argmin(errors))]  # the first of equal ones
