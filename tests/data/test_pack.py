@@ -218,20 +218,18 @@ def test_killed_while_it_is_finished(pack: Pack, tmp_path: Path, monkeypatch: py
     assert contents(tmp_path / "q") == contents(pack.path)
 
 
-def test_leftovers_in_the_folder_do_not_get_into_the_pack(pack: Pack, tmp_path: Path) -> None:
+def test_an_unfinished_pack_is_continued_by_its_own_data_and_leftovers_do_not_get_in(
+    pack: Pack, tmp_path: Path
+) -> None:
     """Those of a build that was killed at its very end."""
     partial = almost_finished(tmp_path / "p", Toy())
+    with pytest.raises(ValueError, match="unfinished pack of something else"):
+        toy_pack(tmp_path / "p", num=60)
     for name in ("pack/pack.json", "pack/.pack.json.1.tmp", "pack/vision.npy"):
         (partial / name).write_bytes(b"of old")
     toy_pack(tmp_path / "p")
     assert contents(tmp_path / "p") == contents(pack.path)
     assert sorted(path.name for path in (tmp_path / "p").iterdir()) == sorted([*FILES, "provenance.json"])
-
-
-def test_unfinished_pack_of_something_else_is_not_continued(tmp_path: Path) -> None:
-    almost_finished(tmp_path / "p", Toy())
-    with pytest.raises(ValueError, match="unfinished pack of something else"):
-        toy_pack(tmp_path / "p", num=60)
 
 
 def test_parts_are_made_again_from_the_first_whose_files_have_changed(pack: Pack, tmp_path: Path) -> None:

@@ -74,21 +74,14 @@ def test_a_window_shows_this_frame_and_earlier_ones_of_the_same_touch(presses: P
     assert shown(windowed(presses, Window(frames=3, stride=2)), 4, 5) == [5, 3, 1]
     assert pack.images["touch"].shape == (presses.num, 16, 16, 9)
     assert pack.spec.channels("touch") == 9 and pack.spec.channels("vision") == 3
-
-
-def test_frames_are_found_by_their_place_not_by_their_row(presses: Pack) -> None:
-    rows = np.random.default_rng(0).permutation(presses.num)
-    pack = windowed(presses, Window(frames=2))
+    rows = np.random.default_rng(0).permutation(presses.num)  # frames are found by their place, not by their row
     assert np.array_equal(pack.images["touch"][rows], [pack.images["touch"][int(row)] for row in rows])
 
 
-def test_rows_at_the_start_can_be_left_out(presses: Pack) -> None:
+def test_rows_at_the_start_can_be_left_out_and_the_first_frame_subtracted(presses: Pack) -> None:
     pack = windowed(presses, Window(frames=3, short="leave-out"))
     assert sorted(set(pack.column("frame")[pack.rows("train", "val", "test")].tolist())) == [2, 3, 4, 5]
     assert len(windowed(presses, Window(frames=3)).rows("train", "val", "test")) == presses.num
-
-
-def test_the_first_frame_of_the_touch_can_be_subtracted(presses: Pack) -> None:
     pack = windowed(presses, Window(frames=2, minus_first=True))
     for row in range(presses.num):
         assert (pack.images["touch"][row][..., :3] == 128 + int(pack.column("frame")[row])).all()

@@ -104,10 +104,10 @@ def test_lerobot_of_version_2_has_a_file_per_episode(tmp_path: Path) -> None:
         (root / f"data/{chunk}").mkdir(parents=True, exist_ok=True)
         pq.write_table(pa.Table.from_pylist(rows), root / f"data/{chunk}/{name}.parquet")
     config = LeRobotConfig(path=root, size=16, labels=("task",), values=("force:N",))
-    by_task = packed(
-        replace(config, group="task", labels=(), values=()), tmp_path / "by-task"
-    )  # a window never crosses episodes
-    assert len({*by_task.column("group")}) == 2 and len({*by_task.column("touch_group")}) == 4
+    by_task = packed(replace(config, group="task", labels=(), values=()), tmp_path / "by-task")
+    assert (
+        len({*by_task.column("group")}) == 2 and len({*by_task.column("touch_group")}) == 4
+    )  # no window crosses episodes
     pack = packed(config, tmp_path / "pack")
     episode, frame = pack.column("episode").astype(int), pack.column("frame").astype(int)
     assert pack.num == 32 and (pack.values(pack.spec.values[0])[:, 0] == frame / 2).all()

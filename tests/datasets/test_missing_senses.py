@@ -1,6 +1,5 @@
 """Rows that lack a modality: stored and marked, never trained on as a pair, never probed on what they lack."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,6 @@ import torch
 
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
-from mvitac.datasets.pack import PackConfig
 from mvitac.deploy import search
 from mvitac.deploy.export import ExportConfig, _examples, export
 from mvitac.deploy.export_module import ExportModule
@@ -18,11 +16,11 @@ from mvitac.evaluation import sensors
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.probe import split_rows
 from mvitac.model import Model, load
-from mvitac.recipes import recipe
 from mvitac.training.loop import train
 from mvitac.training.sampler import draw_positives
 from mvitac.training.views import StepViews
 from support.toy import Holes, Toy, altered
+from support.training_runs import smoke
 
 
 @pytest.fixture(scope="module")
@@ -50,18 +48,15 @@ def test_training_sees_whole_pairs_only(holes: Pack, tmp_path: Path, monkeypatch
     seen: list[int] = []
     real = StepViews.make
     monkeypatch.setattr(StepViews, "make", lambda self, rows, seed: seen.extend(rows) or real(self, rows, seed))
-    run = replace(recipe("smoke", PackConfig(path=holes.path, size=32)), steps=4, eval_every=4, positives="same-touch")
-    train(run, tmp_path / "run", quiet=True)
+    train(smoke(holes, steps=4, eval_every=4, positives="same-touch"), tmp_path / "run", quiet=True)
     whole = holes.has("vision") & holes.has("touch")
     assert whole[seen].all() and set(seen) <= set(holes.rows("train", "unlabelled"))
-
     assert whole[draw_positives(holes, np.array(seen), torch.Generator().manual_seed(0))].all()
 
 
 @pytest.fixture(scope="module")
 def trained(holes: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = replace(recipe("smoke", PackConfig(path=holes.path, size=32)), steps=1, eval_every=0)
-    return train(run, tmp_path_factory.mktemp("holes") / "run", quiet=True)
+    return train(smoke(holes, steps=1, eval_every=0), tmp_path_factory.mktemp("holes") / "run", quiet=True)
 
 
 def test_probes_see_only_what_is_there(holes: Pack, trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,18 +11,18 @@ import torch
 import mvitac
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
-from mvitac.datasets.pack import PackConfig
 from mvitac.deploy.export import ExportConfig, export
 from mvitac.evaluation.evaluate import ProbeConfig
 from mvitac.experiments.collect import gather, lay_out, outline
 from mvitac.experiments.jobs import do, do_all
-from mvitac.experiments.plan import Plan, Row
+from mvitac.experiments.plan import Row
 from mvitac.experiments.table import lines_of
 from mvitac.experiments.table_formats import latex, markdown
 from mvitac.run import Run, load_run
 from mvitac.system import device as devices
 from mvitac.system.device import Hardware
 from mvitac.training.loop import train
+from support.small_plans import small
 from support.training_runs import assert_equal_weights, power_cut, smoke
 
 CPU = torch.device("cpu")
@@ -128,8 +128,7 @@ def test_a_checkpoint_goes_on_in_its_own_precision_alone(pack: Pack, tmp_path: P
 
 def test_compare_says_where_runs_differ(pack: Pack, tmp_path: Path, hardware: Machine) -> None:
     rows = (Row(label="MViTac"), Row(label="in fp32", set={"precision": "fp32"}))
-    plan = Plan(name="p", rows=rows, recipe="smoke", seeds=2, set={"steps": 2, "eval_every": 0, "precision": "auto"})
-    plan = replace(plan, data=PackConfig(path=pack.path))
+    plan = small(pack, rows=rows, set={"steps": 2, "eval_every": 0, "precision": "auto"})
     out, session = tmp_path / "out", ProbeConfig(controls=False)
     hardware(False)
     work = lay_out(plan, pack, out, session)
