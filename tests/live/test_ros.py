@@ -113,10 +113,14 @@ def test_it_answers_at_its_rate_under_image_times(onnx: Path, monkeypatch: pytes
     assert heard[-1].startswith("touch 0: images are 5.0 s old by their headers")
 
 
-def test_topics_that_the_model_does_not_take(onnx: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_topics_than_the_model_takes_and_depth_are_refused(onnx: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Robot(monkeypatch, export=str(onnx), vision=VISION)
     with pytest.raises(ValueError, match=r"the model takes \{'vision': 1, 'touch': 1\}"):
         load_node().main()
+    topic = load_node().Topic("/gel")
+    topic.message = raw(0, np.zeros((4, 6, 1), np.uint16), "16UC1")
+    with pytest.raises(ValueError, match="encoding 16UC1: publish 8 bits"):
+        topic.read()
 
 
 @pytest.mark.parametrize("encoding", ["mono8", "rgb8", "bgr8", "rgba8", "bgra8", "compressed"])
@@ -131,13 +135,6 @@ def test_an_image_is_read_as_rgb(encoding: str) -> None:
     topic = load_node().Topic("/gel")
     topic.message = compressed(7.5, image) if encoding == "compressed" else raw(7.5, pixels, encoding)
     assert np.array_equal(topic.read(), image) and topic.captured == START + 7.5
-
-
-def test_depth_is_refused() -> None:
-    topic = load_node().Topic("/gel")
-    topic.message = raw(0, np.zeros((4, 6, 1), np.uint16), "16UC1")
-    with pytest.raises(ValueError, match="encoding 16UC1: publish 8 bits"):
-        topic.read()
 
 
 ROBOT = """

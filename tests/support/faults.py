@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.live.cameras import Ended, Source
+from mvitac.live.cameras import Source
 from mvitac.live.contact import LiveConfig
 from mvitac.live.predictor import Live
 from mvitac.live.streams import Event, Stream
@@ -38,17 +38,12 @@ class Rig(Source):
         self.clock, self.size, self.fault = clock, size, ""
         self.rng = np.random.default_rng(seed)
         self.base = self.rng.integers(60, 120, (size, size, 3)).astype(np.uint8)
-        self.ended = False
-        self.opened = 0
 
     def open(self) -> None:
         if self.fault == "unplugged":
             raise OSError("no such device")
-        self.opened += 1
 
     def read(self) -> np.ndarray:
-        if self.ended:
-            raise Ended
         if self.fault == "unplugged":
             raise OSError("select() timeout")
         if self.fault == "damaged":
