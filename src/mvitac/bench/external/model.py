@@ -194,14 +194,9 @@ class ExternalModel(Model):
 
     def describe(self) -> dict[str, Any]:
         """What is needed to repeat and to judge the scores, JSON-ready."""
-        return {
-            "encoder": self.text,
-            "title": self.title,
-            "seed": self.seed,
-            "weights": self.weights_digest(),
-            "notes": list(self.notes),
-            "encoders": {modality: _described(part) for modality, part in self.parts.items()},
-        }
+        known = {"encoder": self.text, "title": self.title, "seed": self.seed, "weights": self.weights_digest()}
+        encoders = {modality: _described(part) for modality, part in self.parts.items()}
+        return {**known, "notes": list(self.notes), "encoders": encoders}
 
 
 def _described(part: ExternalEncoder) -> dict[str, Any]:
