@@ -392,7 +392,11 @@ FORGED: dict[str, tuple[Change, str]] = {
     "negative squares": (put(*VALUES, "sums", "squared_error", 0, 0, value=-1.0), "squared errors are smaller"),
     "large squares": (put(*VALUES, "sums", "squared_error", 0, 0, value=1e9), "squared errors are smaller or larger"),
     "unit": (put(*VALUES, "targets", 0, 1, value="kN"), "is scored on other rows"),
-    "data": (put("blocks", 1, "data", "rows", value="0" * 64), "its data is not that of the set's other tasks"),
+    "data": (put("blocks", 1, "data", "rows", value="0" * 64), "its data or groups are not those of the set's other"),
+    "groups": (
+        put("blocks", 1, "group_by", value="frame"),
+        "its data or groups are not those of the set's other tasks",
+    ),
     "licence": (put("encoder", "licence", value={}), "licence is no text"),
     "infinity": (put(*VALUES, "sums", "error", 0, 0, value=1e999), "is not finite"),
     "no sums": (put(*RECORDS, 0, "sums", value={}), "its sums"),

@@ -98,8 +98,11 @@ def levels(pack: Pack, modality: str) -> list[int]:
 
 def test_one_row_per_entry_of_the_first_axis(tmp_path: Path) -> None:
     values = ("force_n:N", "pose=pose[2]:mm,pose[1]:deg", "depth:mm")
-    config = FolderConfig(path=write(tmp_path / "a.h5", flat()), values=values, labels=("held",), **FLAT)
+    kind = np.array([i % 2 for i in range(20)], h5py.enum_dtype({"wood": 1, "metal": 0}, basetype="i"))
+    file = write(tmp_path / "a.h5", flat(kind=kind))
+    config = FolderConfig(path=file, values=values, labels=("held", "kind"), **FLAT)
     pack = packed(config, tmp_path / "pack")
+    assert [pack.spec.tasks[1].classes[i] for i in pack.column("label_kind")[:2]] == ["metal", "wood"]
     rows = np.array(levels(pack, "vision"))
     assert sorted(rows) == list(range(20)) and levels(pack, "touch") == (100 + rows).tolist()
     force, pose, depth = (pack.values(task) for task in pack.spec.values)
@@ -181,6 +184,9 @@ def test_columns_of_episodes_are_ours(tmp_path: Path) -> None:
 
 
 def test_what_a_demonstration_lacks(tmp_path: Path) -> None:
+    twice = r"obs and next_obs of data/demo_0 hold the same images: name them obs/"
+    with pytest.raises(ValueError, match=twice):
+        FolderConfig(path=demos(tmp_path), **DEMOS | {"touch": ("gel",)}).source()
     path = demos(tmp_path, **{"data/demo_1/force": None, "data/demo_3/obs/gel": None})
     with pytest.raises(ValueError, match=r"row 13 \(data/demo_3/0\) has no obs/gel path: .*--data\.allow-missing"):
         FolderConfig(path=path, **DEMOS).source()
@@ -317,6 +323,10 @@ def test_numbers_of_more_than_8_bits(tmp_path: Path) -> None:
     write(tmp_path / "b.h5", {"touch": grays(*range(20)).astype(np.int64), "vision": (300 * deep[..., :1]).astype(int)})
     pack = packed(FolderConfig(**(options | {"path": tmp_path / "b.h5"}), vision=""), tmp_path / "i")
     assert levels(pack, "touch") == list(range(20))  # 8 bits, however they are stored
+    broken = np.where(np.arange(20) == 5, np.nan, 0.5)[:, None, None, None] * np.ones((1, 16, 16, 3), np.float32)
+    write(tmp_path / "nan.h5", {"touch": broken})
+    with pytest.raises(ValueError, match=r"nan\.h5 /touch row 5: it has values that are NaN or infinite"):
+        packed(FolderConfig(path=tmp_path / "nan.h5", size=16, allow_leak=True), tmp_path / "nan")
     with pytest.raises(ValueError, match=r"its values lie in 268 to 268, not 0 to 255: --data\.range"):
         packed(FolderConfig(**(options | {"path": tmp_path / "b.h5"})), tmp_path / "j")
     rows = []

@@ -218,6 +218,8 @@ def test_slip_gsmini_counts_copies_once(packs: dict[str, Pack]) -> None:
         assert pack.column("label_conflict")[i] == str(int(conflict))
         assert pack.column("author_split")[i] == ("train" if k < 6 else "val") and pack.column("n_frames")[i] == 30 + n
     assert (pack.column("label_conflict") == "1").sum() == 12
+    alone = "franka-servo/datasets/thing_9/exp_num_1"
+    assert pack.spec.notes == (f"1 folders without both videos are left out, such as {alone}",)
 
 
 def test_physiclear_labels_are_read_not_run(packs: dict[str, Pack], clones: Path) -> None:
@@ -263,7 +265,7 @@ def test_physiclear_newer_layout_and_missing_labels(clones: Path, tmp_path: Path
 
 def test_vt60_pairs_are_weak_but_right(packs: dict[str, Pack]) -> None:
     pack = packs["vt60"]
-    assert pack.num == 18 * 5
+    assert pack.num == 18 * 5 and pack.spec.notes == ("objects without touches are left out: 03_ball/07",)
     for row in range(pack.num):
         i, k = int(pack.column("group")[row][-1]), int(pack.column("seq")[row])
         assert abs(level(pack.images["vision"][row]) - (10 * (k % 3) + i)) < 3

@@ -12,6 +12,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from mvitac.data.build import build
 from mvitac.data.images import ros_pixels
 from mvitac.data.pack import Pack
+from mvitac.datasets.base import dataset
 from mvitac.datasets.rosbag import Message, RosbagConfig
 from support.ros import START, STORE, compressed, raw, stamped
 
@@ -56,6 +57,7 @@ def test_topics_are_joined_by_the_time_in_their_headers(tmp_path: Path, plugin: 
         write_bag(tmp_path / f"bags/grasp.{number}", plugin, number)
     options: dict[str, Any] = {"touch": (GEL,), "vision": FRONT, "values": (f"{WRENCH}.wrench.force.z:N",), "size": 16}
     config = RosbagConfig(path=tmp_path / "bags", every=1, tolerance=0.045, **options)
+    assert all(isinstance(dataset(str(path)), RosbagConfig) for path in (config.path, config.path / "grasp.1"))
     assert replace(config, interpolate="nearest").source().items()  # values are joined without --log, too
     pack = packed(config, tmp_path / "pack")
     time, which = pack.column("time").astype(float) - START, pack.column("recording")

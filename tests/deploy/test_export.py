@@ -31,7 +31,7 @@ from mvitac.model import Model, fresh
 from mvitac.nn.linear_probe import Error
 from mvitac.transforms.random_views import plain_view
 from support.processes import begin, finish
-from support.toy import renumbered, toy_pack
+from support.toy import renumbered, toy_pack, with_columns
 from support.training_runs import smoke
 
 EXACT = {"min_cosine": 0.9999, "accuracy_loss": 0.0}
@@ -197,6 +197,8 @@ def test_export_of_touch_alone(smoke_run: Path, pack: Pack, tmp_path: Path) -> N
     expected = with_probes(mvitac.load(smoke_run), pack).predict(touch=images)["pattern"]
     np.testing.assert_allclose(found["probability_pattern"], expected, atol=1e-4)
     assert main(command) == 2  # it is already there
+    recorded, model = with_columns(pack, split=["unlabelled"] * pack.num), with_probes(mvitac.load(smoke_run), pack)
+    assert export(model, recorded, tmp_path / "r", ExportConfig(modalities=("touch",), num_rows=9))["num_rows"] == 9
 
 
 def test_two_sensors_are_normalised_alike(tmp_path: Path) -> None:

@@ -526,9 +526,11 @@ def test_sigterm_ends_it_as_ctrl_c_does(
 
     monkeypatch.setattr(Live, "step", until_killed)
     before = signal.getsignal(signal.SIGTERM)
-    assert main(["live", str(onnx), "--always", "--calibration", "2", "--record", str(tmp_path / "r")]) == 0
+    words = ["--vision", "sim#0:0:64:60", "--touch", "sim", "--always", "--calibration", "2"]
+    assert main(["live", str(onnx), *words, "--record", str(tmp_path / "r")]) == 0
     assert "stopped" in (said := capsys.readouterr().err) and "summary: " in said
-    assert Pack(tmp_path / "r").num > 0 and signal.getsignal(signal.SIGTERM) == before
+    assert (pack := Pack(tmp_path / "r")).num > 0 and pack.spec.crop == {"vision": "0:0:64:60"}
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 @pytest.fixture(scope="module")

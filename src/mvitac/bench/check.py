@@ -63,8 +63,9 @@ def problems(value: dict[str, Any]) -> list[str]:
     here = {one.name for one in suite.sets for form in one.forms if not form.at}  # data that can be had anywhere
     here |= {block["set"] for block in value["blocks"] if "data" in block}
     for block, (one, ask) in zip(value["blocks"], asked, strict=True):
-        if "data" in block and data.setdefault(one.name, block["data"]) != block["data"]:
-            found.append(f"{one.name}, {ask.name}: its data is not that of the set's other tasks")
+        held = block.get("data"), block.get("group_by")
+        if "data" in block and data.setdefault(one.name, held) != held:
+            found.append(f"{one.name}, {ask.name}: its data or groups are not those of the set's other tasks")
         given: list[tuple[Sequence[str], str]] = [((m,), why) for m, why in block.get("left_out", {}).items()]
         if "not_run" in block and (one.name in here or block["not_run"].startswith("the encoder ")):
             given.append((ask.modalities, block["not_run"]))

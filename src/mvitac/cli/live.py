@@ -109,7 +109,9 @@ def live(argv: list[str]) -> None:
     more: Any = {"tell": lambda event: _say(event.text), "free": free, "always": options.always}
     loop, recorder = Live(engine, streams, options.live, **more), None
     if options.record:  # last, for a refusal must leave no spool
-        loop.record = recorder = Recorder(options.record, sensor=sensor, tell=_say)
+        cuts = ((m, [s.origin.crop for s in several if s.origin.crop]) for m, several in streams.items())
+        crop = {m: ", ".join(":".join(map(str, cut)) for cut in parts) for m, parts in cuts if parts}
+        loop.record = recorder = Recorder(options.record, sensor=sensor, crop=crop, tell=_say)
     _run(loop, options.seconds)
     if loop.counts["calibrated"] < sum(contact.free is None for contact in loop.contacts.values()):
         _say(f"contact was never known: no {options.live.calibration} frames without it, and no --background")

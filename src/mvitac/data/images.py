@@ -96,7 +96,9 @@ def to_gray(values: np.ndarray, span: Sequence[float], clip: bool) -> np.ndarray
     """Scale numbers to uint8, so that ``span`` becomes 0 to 255; without ``clip``, others are a ValueError."""
     low, high = span
     least, most = float(values.min()), float(values.max())
-    if not np.isfinite(values).all() or (not clip and (least < low or most > high)):
+    if not np.isfinite(values).all():
+        raise ValueError("it has values that are NaN or infinite")
+    if not clip and (least < low or most > high):
         raise ValueError(f"its values lie in {least:g} to {most:g}, not {low:g} to {high:g}: --data.range")
     return np.rint(np.clip((values - np.float64(low)) / (high - low), 0, 1) * 255).astype(np.uint8)
 

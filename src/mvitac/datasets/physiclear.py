@@ -53,7 +53,7 @@ class PhysiclearConfig(RowsConfig):
         labels = {label: known[name] for label, name in LABELS.items()}
         split = {name: side for side, constant in SPLIT.items() for name in known[constant]}
         rows: list[dict[str, str]] = []
-        for path in sorted(videos.glob("*.mov")):
+        for path in sorted(videos.glob("*.[mM][oO][vV]")):
             thing = path.stem.rpartition("_")[0]
             key = f"physiclear_{thing}"
             length = num_frames(path)

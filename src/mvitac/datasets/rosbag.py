@@ -47,11 +47,12 @@ class RosbagConfig(RecordedConfig):
 
     @classmethod
     def reads(cls, path: Path) -> bool:
-        return path.suffix == ".bag" or (path / "metadata.yaml").is_file()
+        return path.suffix == ".bag" or any(any(path.glob(f)) for f in ("metadata.yaml", "*/metadata.yaml", "*.bag"))
 
     def manifest(self) -> Manifest:
-        path, bags = self.path, [self.path] if self.reads(self.path) else []
-        if not bags and path.is_dir():
+        path, alone = self.path, self.path.suffix == ".bag" or (self.path / "metadata.yaml").is_file()
+        bags = [path] if alone else []
+        if not alone and path.is_dir():
             bags = sorted([*(file.parent for file in path.rglob("metadata.yaml")), *path.rglob("*.bag")])
             for file in sorted([*path.rglob("*.mcap"), *path.rglob("*.db3"), *path.rglob("*.bag.active")]):
                 if file.parent not in bags:

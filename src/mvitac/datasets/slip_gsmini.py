@@ -45,9 +45,11 @@ class SlipGSMiniConfig(RowsConfig):
     def manifest(self) -> Manifest:
         root = in_clone(self.path, "docs", "**/exp_num_*/camera_0.avi", self.source_url)
         copies: dict[tuple[str, ...], list[Path]] = {}
-        for first in sorted(root.glob("**/exp_num_*/camera_0.avi")):
-            folder = first.parent
-            if all((folder / name).is_file() for name in FINGERS.values()):
+        lonely: list[str] = []
+        for folder in sorted({file.parent for name in FINGERS.values() for file in root.glob(f"**/exp_num_*/{name}")}):
+            if not all((folder / name).is_file() for name in FINGERS.values()):
+                lonely.append(folder.relative_to(root).as_posix())
+            else:
                 copies.setdefault(tuple(digest_file(folder / name) for name in FINGERS.values()), []).append(folder)
         rows: list[dict[str, str]] = []
         for folders in copies.values():  # of one recording
@@ -75,4 +77,5 @@ class SlipGSMiniConfig(RowsConfig):
         for row in rows:
             often.setdefault(row["object"], []).append(int(row["slip"] or 0))
         add_folds(rows, [f"{sum(often[row['object']]) / len(often[row['object']]):.2f}" for row in rows], 3)
-        return Manifest.of(root, rows)
+        note = f"{len(lonely)} folders without both videos are left out, such as {lonely[0]}" if lonely else ""
+        return Manifest.of(root, rows, notes=(note,) * bool(note))

@@ -51,9 +51,11 @@ class VT60Config(RowsConfig):
                 pose = dict(zip("xyz", at.groups() if at else ("", "", ""), strict=True))
                 rows.append({**images, "category": thing.split("/")[0], "object": thing, "seq": str(k), **pose})
         add_folds(rows, [row["category"] for row in rows], 3)
-        return Manifest.of(root, rows)
+        bare = {"/".join(path.parts[-2:]) for path in root.glob("vision/*/*/")} - {row["object"] for row in rows}
+        note = f"objects without touches are left out: {', '.join(sorted(bare))}"
+        return Manifest.of(root, rows, notes=(note,) * bool(bare))
 
 
 def _by_number(folder: Path) -> list[Path]:
-    numbers = {path: re.search(r"img_(\d+)", path.name) for path in folder.glob("*.jpg")}
+    numbers = {path: re.search(r"img_(\d+)", path.name) for path in folder.glob("*.[jJ][pP][gG]")}
     return sorted(numbers, key=lambda path: (int(found[1]) if (found := numbers[path]) else -1, path.name))

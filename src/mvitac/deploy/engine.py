@@ -49,7 +49,7 @@ class Engine:
     Examples:
         engine = Engine("exports/first")
         probabilities = engine(vision=photos, touch=presses)["probability_category"]   # [B, K]
-        newtons = engine(vision=photos, touch=presses)["value_force_n"]                # [B, 1]
+        newtons = engine(vision=photos, touch=presses)["value_force"]                  # [B, 1]
     """
 
     def __init__(self, folder: str | Path, *, engine: Runtime = "auto", threads: int = 0) -> None:

@@ -58,9 +58,9 @@ def export(
             raise ValueError(f"{given.path} cannot check this model: it needs images of {what}")
     graph = ExportModule(model, asked, learn_looks(known, new, NEW_SENSOR) if new else None)
     rows = pack.rows("test", having=asked)
-    if new and not len(rows):
-        rows = np.flatnonzero(np.logical_and.reduce([new.has(modality) for modality in asked]))
-    if not len(rows) and not len(rows := pack.rows("val", "train", having=asked)):  # recordings have no test
+    if not len(rows):  # of a recording
+        rows = np.flatnonzero(np.logical_and.reduce([pack.has(modality) for modality in asked]))
+    if not len(rows):
         raise ValueError(f"{pack.path} has no rows with {' and '.join(asked)} to check the export on")
     rows = sample(rows, config.num_rows)
     with new_folder(out) as partial:

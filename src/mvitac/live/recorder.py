@@ -4,8 +4,9 @@ After a crash the spool stays, and ``finish`` makes the pack.
 """
 
 import io
+import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import cached_property
 from pathlib import Path
@@ -19,17 +20,19 @@ from mvitac.data.spec import DataSpec
 from mvitac.system.files import brief, digest_file, write_atomic
 from mvitac.system.locks import check_new, hold_lock
 
+Tell = Callable[[str], object]
+Crop = Mapping[str, str]  # as ``DataSpec.crop``
 SPOOL = 64  # pairs per file of the spool: the number that a crash can lose
 
 
 class Recorder:
     """Call it with every pair; at most ``fps`` per second are kept. A full disk ends it, and ``tell`` gets a sentence."""
 
-    def __init__(self, out: Path, *, fps: float = 10, sensor: str = "", tell: Callable[[str], object] = print) -> None:
+    def __init__(self, out: Path, *, fps: float = 10, sensor: str = "", crop: Crop | None = None, tell: Tell = print):
         """Record into the new folder ``out``; ``sensor`` is the touch sensor's name, if it is known (column sensor)."""
         check_new(out)
         self.out, self.every, self.tell, self.failed = out, 1 / fps, tell, False
-        self.named = {"sensor": sensor} if sensor else {}
+        self.named, self.crop = {"sensor": sensor} if sensor else {}, np.array(json.dumps(dict(crop or {})))
         self.spool = _spool(out)
         if self.spool.exists():
             still = "is of a recording that still runs, or crashed and is finished by"
@@ -61,7 +64,7 @@ class Recorder:
         arrays = {m: np.stack([images[m] for images in pairs]) for m in pairs[0]}
         columns = {f"column_{name}": np.array([row[name] for row in rows]) for name in rows[0]}
         buffer = io.BytesIO()
-        np.savez(buffer, **arrays, **columns)  # type: ignore[arg-type]
+        np.savez(buffer, crop=self.crop, **arrays, **columns)  # type: ignore[arg-type]
         try:
             write_atomic(self.spool / f"{self.num:08d}.npz", lambda file: file.write(buffer.getvalue()))
         except OSError as error:
@@ -121,6 +124,8 @@ class Recorded(Source):
     def spec(self) -> DataSpec:
         channels: Any = {f"{m}_channels": self.shapes.get(m, (0,))[-1] for m in ("vision", "touch")}
         about: Any = {"name": "recording", "group_by": "phase", "source": "mvitac live", "tasks": ()}
+        with np.load(self.files[0], allow_pickle=False) as part:
+            about["crop"] = json.loads(part["crop"].item())
         return DataSpec(**about, **channels, licence="as the one who recorded it decides")
 
     def items(self) -> Sequence[str]:

@@ -135,6 +135,9 @@ def _demonstrations(file: Path, datasets: dict[str, Any], images: Collection[str
     groups = list(dict.fromkeys(path[: -len(name)].rstrip("/") for path, name in shown))
     if not groups:
         raise _no_images(file, images or USUAL[:2], _seen(datasets))
+    for home, _, name in (group.rpartition("/") for group in groups):  # robomimic keeps each image twice
+        if f"{home}/next_{name}".lstrip("/") in groups:
+            raise ValueError(f"{file}: {name} and next_{name} of {home} hold the same images: name them {name}/...")
     return groups
 
 
@@ -220,7 +223,9 @@ def _columns(
                 left_out.setdefault(name, f"is not UTF-8 text in {demo}: write it again")
                 continue
             values = np.reshape(values, (-1,)) if data.size in (1, num) else values
-            cells[name] = [text_of(value) for value in values.tolist()]
+            enumeration = (data.dtype.metadata or {}).get("enum") or {}  # of HDF5: name -> number
+            texts = {number: text for text, number in enumeration.items()}
+            cells[name] = [text_of(texts.get(v, v) if values.ndim == 1 else v) for v in values.tolist()]
     return cells
 
 

@@ -145,7 +145,10 @@ def picture(found: str | bytes | np.ndarray, ref: ImageRef) -> Image.Image:
     if not 0 < (num := pixels.shape[0] * pixels.shape[1]) <= MAX_PIXELS:
         raise ValueError(f"{ref} has {num:,} pixels: 1 to {MAX_PIXELS:,} are read")
     if pixels.dtype != np.uint8 or ref.span:
-        pixels = to_gray(pixels, ref.span or _usual(pixels.dtype), bool(ref.span))
+        try:
+            pixels = to_gray(pixels, ref.span or _usual(pixels.dtype), bool(ref.span))
+        except ValueError as error:
+            raise ValueError(f"{ref}: {error}") from None
     pixels = pixels.reshape(*pixels.shape[:2], -1)
     if pixels.shape[2] == 2:  # such as a field of motion
         pixels = np.concatenate([pixels, np.zeros_like(pixels[:, :, :1])], axis=2)

@@ -96,7 +96,7 @@ def check_sides(
     for task, target in zip(tasks, targets, strict=True):
         for side in ("train", "test"):
             if not any(label >= 0 and s == side for label, s in zip(target, splits, strict=True)):
-                raise ValueError(f"{where}: {what} gives label {task.name!r} no rows in {side}: give more groups")
+                raise ValueError(f"{where}: {what} gives {task.name!r} no rows in {side}: give more groups")
 
 
 def folds(groups: Sequence[str], strata: Sequence[str], num: int, val_every: int = 2) -> dict[str, list[str]]:
