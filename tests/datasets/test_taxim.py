@@ -56,7 +56,7 @@ def test_a_damaged_calibration_is_named(radius: float, tmp_path: Path, monkeypat
     np.savez(tmp_path / "dataPack.npz", **whole, touch_center=np.full((2, 2), 99), touch_radius=np.array([60, radius]))
     monkeypatch.setattr("mvitac.datasets.taxim.measured.folder", lambda make: tmp_path)
     taxim._pack.cache_clear()
-    with pytest.raises(ValueError, match=r"dataPack.npz is damaged \(a circle"):
+    with pytest.raises(ValueError, match=r"dataPack.npz is damaged \(not for each image a circle"):
         TaximConfig(makes=("gelsight",)).source().items()
     (tmp_path / "dataPack.npz").write_bytes(b"PK\3\4")
     with pytest.raises(ValueError, match=r"dataPack.npz is damaged"):

@@ -179,7 +179,6 @@ LEAKS = """Leaks compare the rows and groups that an encoder was trained on with
 with the encoder. LEAK? stands where there is none, and no list of its training data is given either."""
 DATA = """Rows with another digest are never compared. 'same': the images, too, are those that the suite was measured on.
 'other pixels', 'other rows': made or decoded on another machine. 'not pinned': the suite has no digest of this form."""
-FOOT = "Made by mvitac bench board. The digest of a result shows changes; it does not prove who measured it."
 
 
 def _page(board: Board) -> str:
@@ -198,7 +197,8 @@ def _page(board: Board) -> str:
         ("encoders", "Encoders and leaks", _encoders(board)),
         ("data", "Data", _data(board)),
     ]
-    return str(page.page(f"mvitac bench: {suite.name}", head, sections, FOOT))
+    foot = "Made by mvitac bench board. The digest of a result shows changes; it does not prove who measured it."
+    return str(page.page(f"mvitac bench: {suite.name}", head, sections, foot))
 
 
 def _text_table(intro: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[Markup]:

@@ -108,12 +108,10 @@ def _pack(make: str) -> dict[str, np.ndarray]:
         with file.open("rb") as opened, np.load(opened) as pack:
             images = {name: np.ascontiguousarray(pack[name][..., 80:560, ::-1]) for name in ("imgs", "f0")}
             centre, radius = (pack[name].astype(float) for name in ("touch_center", "touch_radius"))
-        if not images["imgs"].shape == (len(radius), 480, 480, 3) == (len(centre), *images["f0"].shape) or not len(
-            radius
-        ):
-            raise ValueError("as many images as circles")
-        if not ((centre >= 0) & (centre < (640, 480)) & (radius > 0)[:, None]).all() or radius.max() >= BALL_MM / MM:
-            raise ValueError("a circle that the ball can leave in the frame")
+        same = images["imgs"].shape == (len(radius), 480, 480, 3) == (len(centre), *images["f0"].shape)
+        inside = (centre >= 0) & (centre < (640, 480)) & ((radius > 0) & (radius < BALL_MM / MM))[:, None]
+        if not (same and len(radius) and inside.all()):
+            raise ValueError("not for each image a circle that the ball can leave there")
     except (OSError, EOFError, LookupError, ValueError, BadZipFile) as error:
         raise ValueError(f"{file} is damaged ({brief(error)}): install taxim again") from None
     return images | {"touch_center": centre, "touch_radius": radius}

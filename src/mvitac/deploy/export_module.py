@@ -110,18 +110,9 @@ def write_onnx(graph: ExportModule, path: Path) -> None:
     """Write ``graph`` as the ONNX file ``path``, for batches of 1 to 1024."""
     two = tuple(torch.zeros(2, *shape, dtype=torch.uint8) for shape in graph.inputs.values())
     batch = torch.export.Dim("batch", min=1, max=1024)
-    torch.onnx.export(
-        graph,
-        two,
-        path,
-        dynamo=True,
-        dynamic_shapes=(tuple({0: batch} for _ in two),),
-        input_names=list(graph.inputs),
-        output_names=list(graph.outputs),
-        opset_version=18,
-        external_data=False,
-        verbose=False,
-    )
+    names: Any = {"input_names": list(graph.inputs), "output_names": list(graph.outputs)}
+    shapes: Any = {"dynamo": True, "dynamic_shapes": (tuple({0: batch} for _ in two),)}
+    torch.onnx.export(graph, two, path, **names, **shapes, opset_version=18, external_data=False, verbose=False)
 
 
 def quantise(path: Path, inputs: list[str], examples: list[list[np.ndarray]]) -> None:
@@ -140,18 +131,10 @@ def quantise(path: Path, inputs: list[str], examples: list[list[np.ndarray]]) ->
 
     prepared = path.with_name("prepared.onnx")
     quant_pre_process(str(path), str(prepared), skip_symbolic_shape=True)
-    quantize_static(
-        str(prepared),
-        str(path),
-        Reader(),
-        quant_format=QuantFormat.QDQ,
-        activation_type=QuantType.QUInt8,
-        weight_type=QuantType.QInt8,
-        per_channel=True,
-        reduce_range=True,
-        # Heads and probes stay in fp32: they are small.
-        op_types_to_quantize=["Conv", "Add", "MaxPool", "GlobalAveragePool"],
-    )
+    kinds: Any = {"quant_format": QuantFormat.QDQ, "activation_type": QuantType.QUInt8, "weight_type": QuantType.QInt8}
+    # Heads and probes stay in fp32: they are small.
+    kinds["op_types_to_quantize"] = ["Conv", "Add", "MaxPool", "GlobalAveragePool"]
+    quantize_static(str(prepared), str(path), Reader(), **kinds, per_channel=True, reduce_range=True)
     prepared.unlink()
 
 

@@ -260,13 +260,9 @@ class Live:
     def summary(self) -> dict[str, Any]:
         """Counts, ages in ms from capture to prediction, and events, JSON-ready."""
         p50, p99 = (1000 * float(np.percentile(self.ages, q)) if self.ages else None for q in (50, 99))
-        return {
-            "predictions": self.num_predictions,
-            "touches": self.num_touches,
-            "age_ms": {"p50": p50, "p99": p99, "max": 1000 * self.max_age if self.ages else None},
-            "stale": self.num_stale,
-            "streams": {
-                s.name: {"frames": s.num_frames, "dropped": s.num_dropped, "damaged": s.num_damaged} for s in self.all
-            },
-            "events": dict(self.counts),
+        ages = {"p50": p50, "p99": p99, "max": 1000 * self.max_age if self.ages else None}
+        streams = {
+            s.name: {"frames": s.num_frames, "dropped": s.num_dropped, "damaged": s.num_damaged} for s in self.all
         }
+        known = {"predictions": self.num_predictions, "touches": self.num_touches, "age_ms": ages}
+        return {**known, "stale": self.num_stale, "streams": streams, "events": dict(self.counts)}

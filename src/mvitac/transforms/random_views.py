@@ -111,12 +111,9 @@ def draw(config: ViewAugment, num: int, size: int, generator: torch.Generator) -
     height[none] = width[none] = size
     top = (uniform(num) * (size - height + 1)).long()
     left = (uniform(num) * (size - width + 1)).long()
-    return Drawn(
-        boxes=torch.stack([top, left, height, width], dim=1),
-        flip=uniform(num) < config.flip,
-        grayscale=uniform(num) < config.grayscale,
-        gains=uniform(num, 5, low=1 - config.jitter, high=1 + config.jitter),
-    )
+    boxes = torch.stack([top, left, height, width], dim=1)
+    flip, grayscale = uniform(num) < config.flip, uniform(num) < config.grayscale
+    return Drawn(boxes, flip, grayscale, uniform(num, 5, low=1 - config.jitter, high=1 + config.jitter))
 
 
 def apply(
