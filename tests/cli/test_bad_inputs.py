@@ -118,6 +118,7 @@ WORDS: list[tuple[str, str, str]] = [
     ("", "data info {tmp}/nowhere", "no pack at {tmp}/nowhere"),
     ("", "compare --plan mine.toml --data materials --out {out}", "mine.toml does not exist"),
     ("", "pretrain --from {run}/run.json --data pack --out {out}", "--data"),
+    ("pretrain --data {pack} ", "--data.path {tmp} --out {out}", "is a path, and --data.path gives another"),
     (PRETRAIN, "--encoder.trunk resnet81", "'resnet81'"),
     (PRETRAIN, "--encoder.weights {tmp}/none.pth", "{tmp}/none.pth"),
     (PRETRAIN, "--encoder.weights imagenet", "mvitac_tiny"),

@@ -156,6 +156,11 @@ def test_contact_is_the_column_where_there_is_one(pack: Pack, cells: list[Any]) 
     assert not np.array_equal(read_episodes(pack).touched, asked)
 
 
+def test_a_file_without_its_function_is_no_encoder() -> None:
+    with pytest.raises(ValueError, match=r"'mine.py' is no policy: give FILE.py:function"):
+        suite_policy(find_suite("servo-v1"), ("corner", "known sensor"), "mine.py")
+
+
 def test_an_episode_is_one_recording_of_a_group(pack: Pack) -> None:
     made = with_columns(pack, group=["one object"] * pack.num)
     for own, theirs in zip(read_episodes(made).rows, read_episodes(pack).rows, strict=True):

@@ -116,8 +116,8 @@ def test_lerobot_of_version_2_has_a_file_per_episode(tmp_path: Path) -> None:
     for i in range(32):
         assert abs(level(pack.images["vision"][i]) - shade(frame[i], episode[i])) < 6
         assert abs(level(pack.images["touch"][i]) - shade(frame[i], episode[i] + 1)) < 6
-    (root / "meta/tasks.jsonl").write_text('{"task_')
-    with pytest.raises(ValueError, match=r"tasks\.jsonl cannot be read .*: fetch it again"):
+    (root / "meta/tasks.jsonl").write_text('{"task_index": 0, "task": "a"}\n{"task_')
+    with pytest.raises(ValueError, match=r"tasks\.jsonl cannot be read \(line 2: .*: fetch it again"):
         LeRobotConfig(path=root, labels=("task",)).source()
 
 
@@ -279,6 +279,10 @@ def test_a_pipe_is_no_table(name: str, tmp_path: Path) -> None:
             r"episodes \d and \d share frames of .*file-000\.mp4",
         ),
         ({"from_timestamp": "soon"}, r"meta/episodes, observation\.images\.gelsight in episode 0, is damaged"),
+        (
+            {"from_timestamp": float("nan")},
+            r"meta/episodes, observation\.images\.gelsight in episode 0, begins at nan s",
+        ),
         ({"file_index": None}, r"meta/episodes, observation\.images\.gelsight in episode 0, is damaged"),
     ],
 )

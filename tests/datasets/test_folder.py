@@ -515,6 +515,9 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
     (tmp_path / "b.png").symlink_to("a.png")
     with pytest.raises(ValueError, match="1 of 1 touch images are in more than one split"):
         FolderConfig(path=tmp_path / "same.csv").source()
+    (tmp_path / "lonely/touch/b/pairs.csv").touch()
+    note = "images are read without pairs.csv: if it is their table, give it as --path"
+    assert note in FolderConfig(path=tmp_path / "lonely/touch/b", pictures="touch").manifest().notes
     with pytest.raises(ValueError, match=f"^{tmp_path / 'same.csv'}: every touch has one row"):
         FolderConfig(path=tmp_path / "same.csv", allow_leak=True, order="n", minus_first=True, size=16).open(quiet=True)
     (tmp_path / "half flat/touch/b").symlink_to(tmp_path / "lonely")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 from sklearn.linear_model import Ridge
 from sklearn.metrics import mean_absolute_error, r2_score, root_mean_squared_error
 from sklearn.pipeline import make_pipeline
@@ -15,7 +16,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack
 from mvitac.data.spec import Target
 from mvitac.evaluation.evaluate import ProbeConfig, chosen, probe_runs
-from mvitac.evaluation.intervals import interval, paired_difference
+from mvitac.evaluation.intervals import interval, mean_interval, paired_difference
 from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.regressors import fit_curve, fit_ridge
 from mvitac.evaluation.scores import pool
@@ -85,6 +86,14 @@ def test_one_group_that_moves_alone_gives_its_own_r2_and_no_interval(still: floa
     assert mean == pytest.approx(ours["r2"]) and low == -np.inf and high > 0.99
     difference, low, high, _ = paired_difference([ours], [theirs])
     assert difference == pytest.approx(ours["r2"] - theirs["r2"]) and (low, high) == (-np.inf, np.inf)
+
+
+def test_a_level_over_few_groups_is_no_difference_from_0() -> None:
+    values = np.array([[0.773, 0.701, 0.794, 0.931, 0.771]])
+    _, low, high, p = mean_interval(values, level=True)
+    t = stats.t(4).ppf(0.975) * values.std(ddof=1) / 5**0.5
+    assert (low, high) == pytest.approx((values.mean() - t, values.mean() + t)) and p > 0.05
+    assert mean_interval(values)[1] == 0
 
 
 def test_error_by_range_finds_where_predictions_are_wrong() -> None:

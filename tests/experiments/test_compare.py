@@ -188,7 +188,7 @@ def test_methods_of_these_plans_see_equally_many_images(pack: Pack, name: str) -
         ('reference = "a"\nset = {device = "cpu"}\n[[rows]]\nlabel = "a"', "device: give --device instead"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\nset = {recipe = "paper"}', "recipe: give --recipe"),
         ('reference = "a"\nset = {data.score_on = "val"}\n[[rows]]\nlabel = "a"', "give --data.score-on"),
-        (f'reference = "a"\n[[rows]]\nlabel = "{"é" * 100}"', "one of over 200 bytes"),
+        (f'reference = "a"\n[[rows]]\nlabel = "{"é" * 100}"', "under 200 bytes, without \\*"),
         ('reference = "pixels"\n[[rows]]\nlabel = "pixels"', "row 'pixels' has the name of a control"),
     ],
 )
@@ -411,7 +411,8 @@ def test_tables_say_where_pairs_are_from(done: tuple[Path, dict], pack: Pack) ->
     assert set(said.values()) == {"two rows of a touch", "one row"}
     for other in ("one row", "two rows of a touch"):
         costs = [{**c, "pairs_of": other if c["row"] == "MViTac" else "one row"} for c in done[1]["cost"]]
-        text = markdown({**done[1], "cost": costs}, lines_of(done[1]))
+        text = markdown({**done[1], "cost": costs, "data": "<script>"}, lines_of(done[1]))
+        assert "Data &lt;script>" in text
         assert ("**pairs are not from the same rows (see cost)**" in text) == (other != "one row")
         assert f"| {other} |" in text
 
@@ -447,6 +448,7 @@ def test_names_and_units_are_text_in_latex_and_markdown() -> None:
     text = _tabular(["", "modality", "a & b %"], [["\\input{x} N%$_^~", "touch", "50.0 [40.0, 60.0]"]])
     assert r"\textbackslash{}input\{x\} N\%\$\_\^{}\textasciitilde{}" in text and r"a \& b \%" in text
     assert r"50.0 [40.0, 60.0]" in text
+    assert " {}[1] a\\textbar{}b & touch" in _tabular(["", ""], [["[1] a|b", "touch"]])
     assert pipes(["a|b"], [["c|d"]], words=1) == [r"| a\|b |", "|---|", r"| c\|d |", ""]
 
 

@@ -126,7 +126,11 @@ def _check_choices(rest: Sequence[str], text: Path) -> None:
             continue
         option, choices = known[1], known[2].split("|")
         value = next(iter(rest[rest.index(option) + 1 :]), choices[0])
-        if value in choices or Path(value).exists():
+        if value in choices:
+            continue
+        if Path(value).exists():
+            if option == "--data" and (twice := {word.partition("=")[0] for word in rest} & {"--data.path", "--path"}):
+                raise ValueError(f"--data {value} is a path, and {min(twice)} gives another: give one of them")
             continue
         if option in ("--data", "--method"):  # one's own are in no stored help
             base = importlib.import_module("mvitac.datasets.base" if option == "--data" else "mvitac.methods.base")

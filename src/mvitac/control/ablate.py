@@ -131,7 +131,11 @@ def suite_episodes(suite: Any, cell: tuple[str, ...]) -> Episodes:
 
 def suite_policy(suite: Any, cell: tuple[str, ...], text: str) -> Policy:
     """A policy that ``open_policy`` takes; or that of an encoder, or of "pixels", which learns as rows of the suite do."""
-    if (Path(text) / "config.json").is_file() or (":" in text and not text.startswith("external:")):
+    if (
+        (Path(text) / "config.json").is_file()
+        or text.endswith(".py")
+        or (":" in text and not text.startswith("external:"))
+    ):
         return open_policy(text)
     learn = ridge(pixels if text == "pixels" else encoding(load(text)))
     estimate, world = learn(*suite.taught(suite.lesson(cell))), suite.world(*cell, 0)
@@ -282,7 +286,7 @@ def ablate(policy: Policy, episodes: Episodes) -> dict[str, Any]:
     if again.shape != normal.shape or away(again, normal, scale).max() > SAME:
         raise ValueError("the policy acts differently on the same episodes: give it reset(), and seed what it draws")
     found = {sense: verdict(sense, [row for row in rows if row["sense"] == sense]) for sense in episodes.senses}
-    error = _paired(own, kept)[:3]
+    error = np.maximum(_paired(own, kept, level=True)[:3], 0).tolist()
     if episodes.unit == "failures":  # 0 or 1 of each episode
         error = list(interval([{"group_sizes": [1] * len(kept), "group_correct": [own[each[0]] for each in kept]}]))
     about = {"episodes": len(kept), "of": episodes.of, "unit": episodes.unit, "error": error}
@@ -304,9 +308,9 @@ def _parts(touched: np.ndarray | None, kept: Sequence[np.ndarray]) -> dict[str, 
     return {name: parts for name, parts in found.items() if sum(map(bool, map(len, parts))) > 1}
 
 
-def _paired(values: np.ndarray, episodes: Sequence[np.ndarray]) -> list[float]:
+def _paired(values: np.ndarray, episodes: Sequence[np.ndarray], *, level: bool = False) -> list[float]:
     """Mean over episodes, ends of the 95 % interval, p."""
-    return list(mean_interval(np.array([[values[steps].mean() for steps in episodes if len(steps)]])))
+    return list(mean_interval(np.array([[values[steps].mean() for steps in episodes if len(steps)]]), level=level))
 
 
 def verdict(sense: str, rows: Sequence[Mapping[str, Any]]) -> str:

@@ -104,7 +104,7 @@ class Servo(LoopSuite):
     def text(self, cells: Sequence[dict[str, Any]]) -> str:
         """A cell of a table, of those of all seeds."""
         mm, deg, lost = (np.array([cell[key] for cell in cells]) / cells[0]["n"] for key in self.sums)
-        mean, low, high = np.clip(mean_interval(mm)[:3], 0, task_of(cells[0]["task"]).limit[0])
+        mean, low, high = np.clip(mean_interval(mm, level=True)[:3], 0, task_of(cells[0]["task"]).limit[0])
         share = f", {100 * lost.mean():.0f} % lost" if lost.mean() >= 0.005 else ""
         return f"{mean:.2f} [{low:.2f}, {high:.2f}] mm, {deg.mean():.1f}°{share}"
 

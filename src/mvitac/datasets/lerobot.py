@@ -28,11 +28,11 @@ from mvitac.data.stamps import number_of
 from mvitac.data.video import frame_times
 from mvitac.datasets.table.clocks import nearest
 from mvitac.datasets.table.image_refs import Frame, ImageRef
-from mvitac.datasets.table.manifest import Manifest, Row
+from mvitac.datasets.table.manifest import READERS, Manifest, Row
 from mvitac.datasets.table.parquet import Refs, add_file
 from mvitac.datasets.table.table import RecordedConfig
 from mvitac.registry import unknown
-from mvitac.system.files import brief, check_ordinary, fields_of, parse_json, read_json
+from mvitac.system.files import brief, check_ordinary, fields_of, read_json
 
 FELT = re.compile(r"touch|tactile|gelsight|digit(?!al)|gel\b|finger", re.IGNORECASE)  # usual names of tactile cameras
 RENAMED = {"episode_index": "episode", "frame_index": "frame", "index": "id"}
@@ -121,6 +121,8 @@ class LeRobotConfig(RecordedConfig):
                 if not Path(os.path.normpath(file)).is_relative_to(os.path.normpath(self.path)):
                     raise ValueError(f"video_path leads out of the dataset, to {file}")
                 start, end = episode[f"videos/{key}/from_timestamp"], episode.get(f"videos/{key}/to_timestamp")
+                if not -1e-3 <= start < np.inf:
+                    raise ValueError(f"{where} begins at {start} s: fetch it again")
                 low, high = start - 1e-3, (np.inf if end is None else end) - 1e-3
             used.setdefault(file, []).append((low, high, name))
             if file not in times:
@@ -228,7 +230,7 @@ def _rows(path: Path, begins: tuple[str, ...] = ("",)) -> list[dict[str, Any]]:
     """Return the rows of a .jsonl file, if there is one, or of parquet, of columns whose name ``begins`` so."""
     if path.suffix == ".jsonl":
         try:
-            return [*map(parse_json, path.read_text().splitlines())] if path.is_file() else []
+            return READERS[".jsonl"](path) if path.is_file() else []
         except ValueError as error:
             raise ValueError(f"{path} cannot be read ({brief(error)}): fetch it again") from None
     try:

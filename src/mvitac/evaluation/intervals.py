@@ -82,13 +82,17 @@ def paired_difference(
     return mean, max(-most, mean - margin), min(most, mean + margin), None if one_seed else p
 
 
-def mean_interval(values: np.ndarray) -> tuple[float, float, float, float]:
-    """Mean of ``values`` [seeds, groups], its 95 % interval over both (endless for one group), the p of a mean of 0."""
+def mean_interval(values: np.ndarray, *, level: bool = False) -> tuple[float, float, float, float]:
+    """Mean of ``values`` [seeds, groups], its 95 % interval over both (endless for one group), the p of a mean of 0.
+
+    They are differences, whose interval holds 0 where p is always above .05, or of a ``level``, which 0 says nothing of.
+    """
     if values.shape[1] < 2:
         return float(values.mean()), -math.inf, math.inf, 1.0
     sizes, mean = np.ones(values.shape[1]), float(values.mean())
     groups, seeds = _over_groups(values.mean(0), sizes), _over_seeds(values, sizes)
     margin, p = _margin_and_p(mean, groups, seeds, len(sizes))
+    margin = _margin(groups, seeds) if level else margin
     return mean, mean - margin, mean + margin, p
 
 

@@ -74,8 +74,10 @@ class Plan:
         given = {name for each in (self.set, *(row.set for row in self.rows)) for name, _ in dotted(each)}
         for name in fixed.keys() & given:
             raise ValueError(f"{name}: {fixed[name]}")
-        if not all(0 < len(slug(label).encode()) < 200 for label in labels):  # the name of a folder
-            raise ValueError(f"plan {self.name!r}: a row has no label of letters or digits, or one of over 200 bytes")
+        if not all(0 < len(slug(label).encode()) < 200 and "*" not in label for label in labels):  # a folder; a control
+            raise ValueError(
+                f"plan {self.name!r}: give each row a label of letters or digits, under 200 bytes, without *"
+            )
         if taken := sorted(set(labels) & set(CONTROLS)):
             raise ValueError(f"row {taken[0]!r} has the name of a control: give it another label")
         if len({slug(label) for label in labels}) < len(labels):

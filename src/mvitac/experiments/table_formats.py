@@ -46,7 +46,8 @@ def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
     for c in result["cost"]:
         numbers = [str(c[key]) for key in ("row", "pairs_of", "seeds", "steps", "pairs", "images")]
         rows.append([*numbers, f"{c['trained_parameters'] / 1e6:.2f} M", f"{c['seconds']:.0f}"])
-    return "\n".join([*text, *pipes(heads, rows)]).rstrip() + "\n"
+    whole = "\n".join([*text, *pipes(heads, rows)]).rstrip() + "\n"
+    return re.sub("<(?=[A-Za-z/!])", "&lt;", whole)  # names of the data are no HTML
 
 
 def _tables(result: dict[str, Any], lines: Sequence[Line]) -> Iterator[tuple[str, list[str], list[list[str]]]]:
@@ -177,7 +178,8 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
 def _tabular(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     align = ["left", "left", *["right"] * (len(heads) - 2)]
     text = tabulate(rows, heads, "latex_booktabs", disable_numparse=True, colalign=align)
-    return re.sub(r"(?m)^ *\*(.*?)\*", r" \\textit{\1}", text)  # controls
+    text = re.sub(r"(?m)^ *\*(.*?)\*", r" \\textit{\1}", text).replace("|", r"\textbar{}")  # controls
+    return re.sub(r"(?m)^ *\[", " {}[", text)  # else an option of the line break before
 
 
 def comma(result: dict[str, Any]) -> str:

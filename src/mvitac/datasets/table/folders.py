@@ -15,7 +15,7 @@ from mvitac.data.stamps import in_order, stamped
 from mvitac.data.video import VIDEOS
 from mvitac.datasets.table.clocks import nearest, times_of
 from mvitac.datasets.table.image_refs import Frame, ImageRef
-from mvitac.datasets.table.manifest import Manifest, Row
+from mvitac.datasets.table.manifest import READERS, Manifest, Row
 from mvitac.system.files import digest
 
 CAMERAS = ("touch", "left", "right", "vision")
@@ -38,11 +38,13 @@ def list_images(root: Path, plain: str, every: int | None) -> Manifest:
     rows = [row for split in splits or [""] for row in _split_rows(root, split, plain, every or 1)]
     if not rows:
         raise ValueError(f"{root} holds no manifest, HDF5 file, videos or images ({', '.join(IMAGES)})")
+    tables = sorted(file.name for file in root.iterdir() if file.suffix.lower() in READERS)
+    beside = tuple(f"images are read without {name}: if it is their table, give it as --path" for name in tables)
     if all("label" in row for row in rows):
         if len({row["group"] for row in rows}) == len(rows):  # no groups, which results say
             rows = [{name: cell for name, cell in row.items() if name != "group"} for row in rows]
-        return Manifest.of(root, rows, labels=("label",), notes=("each folder of images is a class",))
-    return Manifest.of(root, rows, group="recording")
+        return Manifest.of(root, rows, labels=("label",), notes=("each folder of images is a class", *beside))
+    return Manifest.of(root, rows, group="recording", notes=beside)
 
 
 def _split_rows(root: Path, split: str, plain: str, every: int) -> list[Row]:
