@@ -77,9 +77,7 @@ def test_what_cannot_be_compared_is_refused(pack: Pack, negative: Pack, tmp_path
         return {"split": ELSEWHERE[sample.columns["split"]]}
 
     def renamed(sample: Sample, _: int) -> dict[str, int]:
-        return {
-            name.replace("label_", "label_other "): sample.columns[name] for name in ("label_pattern", "label_bright")
-        }
+        return {f"label_other {name}": sample.columns[f"label_{name}"] for name in ("pattern", "bright")}
 
     tasks = tuple(replace(task, name=f"other {task.name}") for task in Toy().spec().tasks)
     waves = (Task(name="pattern", classes=("columns", "rows", "waves")),)
@@ -111,9 +109,7 @@ def test_an_image_that_is_learned_from_and_scored_is_refused(pack: Pack, tmp_pat
             JoinedPack(learn, score)
 
 
-def test_probe_learns_on_one_pack_and_meets_another(
-    pack: Pack, negative: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_probe_meets_other_pack(pack: Pack, negative: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     train(smoke(pack, steps=1, eval_every=0), tmp_path / "run", quiet=True)
     asked = ["probe", str(tmp_path / "run"), "--tasks", "pattern", "--modalities", "touch", "--json"]
     assert not main([*asked, str(tmp_path / "new.json"), "--on", str(negative.path), "--learn-on", str(pack.path)])

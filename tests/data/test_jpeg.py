@@ -66,9 +66,7 @@ INDICES += [np.arange(120) % 7 == 0, np.array([[1, 2], [3, 4]]), (slice(3, 90), 
 
 @pytest.mark.parametrize("index", INDICES, ids=str)
 @pytest.mark.parametrize("num_threads", [1, 3])
-def test_indexed_like_the_array_it_stands_for(
-    small: Pack, monkeypatch: pytest.MonkeyPatch, index: Any, num_threads: int
-) -> None:
+def test_indexed_like_its_array(small: Pack, monkeypatch: pytest.MonkeyPatch, index: Any, num_threads: int) -> None:
     images = small.images["touch"]
     whole = np.stack([images[row] for row in range(120)])
     with ThreadPoolExecutor(num_threads) as pool:

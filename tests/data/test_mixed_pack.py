@@ -201,9 +201,7 @@ def test_names_folders_and_weights() -> None:
     assert MixConfig(parts=("a=b=c", "d:e/f")).named_parts() == [("a", Path("b=c"), None), ("f", Path("d:e/f"), None)]
 
 
-def test_a_mix_is_described_and_checked(
-    pack: Pack, gel: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mix_is_told_and_checked(pack: Pack, gel: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     parts = [f"toy={pack.path}", f"gel={gel.path}"]
     assert main(["data", "info", *parts, "--json", str(tmp_path / "info.json")]) == 0
     found = json.loads((tmp_path / "info.json").read_text())

@@ -213,9 +213,7 @@ def test_has_touch_is_seen_not_believed(tmp_path: Path, rows: Table) -> None:
 
 @pytest.mark.parametrize("name", ["group", "id", "touch_group", "crc_vision", "label_material"])
 @pytest.mark.parametrize("given", [{"values": ("{}:N",)}, {"controls": ("which={}",)}])
-def test_numbers_must_not_take_the_place_of_a_column_of_the_pack(
-    tmp_path: Path, rows: Table, given: dict[str, Any], name: str
-) -> None:
+def test_numbers_do_not_take_a_columns_place(tmp_path: Path, rows: Table, given: dict[str, Any], name: str) -> None:
     rows = [{**row, name: i // (1 if name == "id" else 3)} for i, row in enumerate(rows)]
     ((option, (text,)),) = given.items()
     with pytest.raises(ValueError, match=rf"column '{name}' has a name of the pack itself: copy it"):

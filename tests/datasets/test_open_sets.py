@@ -173,18 +173,16 @@ def test_slip_grasp_labels_no_late_frame_where_early_ones_are_lost(tmp_path: Pat
             path.unlink()
     rows = [row for row in SlipGraspConfig(path=tmp_path).manifest().rows if row["object"] == "001"]
     assert len(rows) == 3 * 15 and {int(row["seq"]) for row in rows} == {*range(6, 21)}
-    (file := tmp_path / "data/object001_result.dat").write_text(
-        file.read_text().replace(" 040_0", " ../object002/041_0")
-    )
+    whole = (file := tmp_path / "data/object001_result.dat").read_text()
+    file.write_text(whole.replace(" 040_0", " ../object002/041_0"))
     with pytest.raises(ValueError, match=r"line 1: .* is not a grasp of eight words"):
         SlipGraspConfig(path=tmp_path).manifest()
     file.write_bytes(b"\xff\xfe 1 0 1 2 x y z")
     with pytest.raises(ValueError, match=r"object001_result.dat line 1: .* is not a grasp of eight words"):
         SlipGraspConfig(path=tmp_path).manifest()
     file.unlink()
-    assert SlipGraspConfig(path=tmp_path).source().spec().notes == (
-        "object001 is left out: object001_result.dat says nothing of it",
-    )
+    (note,) = SlipGraspConfig(path=tmp_path).source().spec().notes
+    assert note == "object001 is left out: object001_result.dat says nothing of it"
 
 
 def test_slip_grasp_pairs_by_frame(packs: dict[str, Pack]) -> None:

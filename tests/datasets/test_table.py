@@ -46,12 +46,8 @@ def films(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def film_rows() -> Table:
     order = np.random.default_rng(0).permutation(40).tolist()
-    rows = [
-        {"vision": f"{k}/camera.mp4", "touch": f"{k}/gel.avi", "frame": i, "touch_frame": (i + 3) % 40, "take": k}
-        for k in range(4)
-        for i in order[:12]
-    ]
-    return [{**row, "label": "ab"[row["take"] % 2]} for row in rows]
+    films = [{"vision": f"{k}/camera.mp4", "touch": f"{k}/gel.avi", "take": k, "label": "ab"[k % 2]} for k in range(4)]
+    return [{**film, "frame": i, "touch_frame": (i + 3) % 40} for film in films for i in order[:12]]
 
 
 @pytest.mark.parametrize("workers", [1, 2])

@@ -38,10 +38,8 @@ def test_the_picture_changes_where_the_label_says(options: dict, num: int, withi
 
 
 def test_real_frames_are_only_scored_and_depth_is_known_of_one_ball(tmp_path: Path):
-    learned, real = (
-        build(TaximConfig(num=num, sensors=3 * (num > 0), workers=1).source(), tmp_path / str(num), size=32, workers=1)
-        for num in (40, 0)
-    )
+    sources = [TaximConfig(num=num, sensors=3 * (num > 0), workers=1).source() for num in (40, 0)]
+    learned, real = (build(one, tmp_path / str(i), size=32, workers=1) for i, one in enumerate(sources))
     assert {"train", "val", "test"} == {*learned.column("split")} and {*real.column("split")} == {"test"}
     sensor, depth = real.column("sensor"), real.column("depth_mm")
     assert np.isnan(depth).tolist() == (sensor == "gelsight_mini").tolist()

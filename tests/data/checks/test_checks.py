@@ -363,11 +363,9 @@ def test_resized_copies_in_another_pack_are_found(tmp_path: Path, objects: str) 
         obj, k = divmod(item, NUM_FRAMES)
         shown = obj + 100 if objects == "others" else (obj + 1) % NUM_OBJECTS
         names = {"id": f"new {item}", "group": f"new {obj}", "touch_group": f"new {obj}", "sensor": "new"}
-        vision, touch = (
-            np.asarray(Image.fromarray(image).resize((48, 48), Image.Resampling.BICUBIC))
-            for image in (camera(shown, k), seen(shown, k))
-        )
-        return {"vision": vision, "touch": touch, **names}
+        images = {"vision": camera(shown, k), "touch": seen(shown, k)}
+        larger = {m: Image.fromarray(image).resize((48, 48), Image.Resampling.BICUBIC) for m, image in images.items()}
+        return {m: np.asarray(image) for m, image in larger.items()} | names
 
     one, other = (tmp_path / name for name in ("one", "other"))
     build(altered(Presses(), lambda _, item: {"touch": seen(*divmod(item, NUM_FRAMES))}), one, size=SIDE, quiet=True)
