@@ -245,10 +245,7 @@ def test_command(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str])
         ("return [0, -1e308]", "in step 0 of episode 1: give finite numbers below 1e+60"),
         ("seen.append(0)\n    return [1e-4 * len(seen), o['step']]", "acts differently on the same episodes"),
         ("sys.exit(0)", "fails (SystemExit: 0)"),
-        (
-            "...\npolicy.reset = lambda: 1 / 0",
-            "fails (ZeroDivisionError: division by zero) when reset before episode 1",
-        ),
+        ("...\npolicy.reset = lambda: 1 / 0", "(ZeroDivisionError: division by zero) when reset before episode 1"),
     ):
         file.write_text(f"import sys, numpy as np\nseen = []\ndef policy(o):\n    {code}\n")
         assert main(["ablate", f"{file}:policy", "--data", str(pack.path)]) == 2

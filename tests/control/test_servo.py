@@ -114,9 +114,8 @@ def test_presses_cover_what_probes_need() -> None:
         assert (np.abs(poses - task.target) < 1.25 * task.reach).all() and (poses.std(0) > task.reach / 4).all()
 
 
-def test_a_result_repeats_and_says_how_good_each_row_is(
-    done: Path, small: Servo, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_result_repeats(done: Path, small: Servo, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """And says how good each row is."""
     _, value = result.read_control(done)
     torch.manual_seed(7)  # whatever was drawn before
     _, again = result.read_control(result.run_suite([RANDOM.format(5)], small, tmp_path, About(name="five")))

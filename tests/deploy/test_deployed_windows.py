@@ -153,9 +153,7 @@ def test_a_stream_keeps_no_more_than_a_window_needs() -> None:
     assert 6 <= len(stream._past) <= 7 and stream._past[0][1].shape == (16, 16, 3)
 
 
-def test_export_and_live_of_windows(
-    published: Path, measured: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_exported_windows(published: Path, measured: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The plain pack is opened with the model's windows; live takes the frames of one sensor."""
     out = tmp_path / "export"
     assert main(["export", str(published), "--on", str(measured.path), "--out", str(out)]) == 0, capsys.readouterr().err

@@ -298,9 +298,8 @@ def test_predicted_values_score_as_the_artifact_says(value_artifact: Path, measu
     assert torch.equal(probe(probe.bounds[1:] + 1e6), probe(probe.bounds[1:])), "clipped as in the scores"
 
 
-def test_the_spread_of_a_prediction_is_that_of_test_rows_in_its_range(
-    value_artifact: Path, measured: Pack, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_spread_is_that_of_its_range(value_artifact: Path, measured: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a prediction: that of the test rows in its range."""
     monkeypatch.setattr(publish, "RANGE_ROWS", 5)
     model, task = mvitac.load(value_artifact), measured.spec.values[0]
     model.probes = {}

@@ -50,9 +50,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run"
 
 
-def test_touch_that_knows_the_outcome_lifts_like_the_oracle(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_touch_that_knows_lifts_like_the_oracle(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     regrasp.main([str(run), "--seeds", "2", "--candidates", "2", "--json", str(tmp_path / "found.json")])
     found: dict[str, Any] = json.loads((tmp_path / "found.json").read_text())
     success = {name: rules["again"]["mean"] for name, rules in found["success"].items()}

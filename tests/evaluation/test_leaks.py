@@ -62,9 +62,7 @@ def run(smoke_run: Path, tmp_path: Path) -> Path:
     return shutil.copytree(smoke_run, tmp_path / "run", ignore=shutil.ignore_patterns("probe.json"))
 
 
-def test_scores_of_rows_that_were_trained_on_are_refused(
-    run: Path, turned: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_leaked_scores_are_refused(run: Path, turned: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["probe", str(run), "--on", str(turned.path), "--json", str(tmp_path / "x.json")]) == 2
     error = capsys.readouterr().err
     assert ALL in error and "--allow-leak" in error and "'pattern'" in error and error.count("\n") == 1
@@ -74,9 +72,7 @@ def test_scores_of_rows_that_were_trained_on_are_refused(
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_leak_is_beside_every_score(
-    run: Path, turned: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_leak_is_beside_all_scores(run: Path, turned: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """In the terminal, JSON, the report and the card; not beside controls, which learned nothing from those rows."""
     file = tmp_path / "x.json"
     assert main(["probe", str(run), "--on", str(turned.path), "--allow-leak", "--json", str(file)]) == 0
@@ -238,9 +234,7 @@ def test_equal_checksums_by_chance_are_no_leak(pack: Pack) -> None:
     assert not known_images(pack, rows, np.concatenate([one, others])).any()
 
 
-def test_data_that_changed_since_training_is_said(
-    pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_data_changed_since_training_is_said(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     place = Path(shutil.copytree(pack.path, tmp_path / "pack"))
     run, asked = train(smoke(Pack(place), steps=1), tmp_path / "run", quiet=True), ProbeConfig(controls=False)
     again = ["pretrain", "--from", str(run / "run.json"), "--quiet", "--out"]
