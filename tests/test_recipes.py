@@ -102,10 +102,8 @@ def grasps(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(("name", "file"), [("pack", "pack"), ("folder", "folder.csv")])
-def test_grasps_have_the_recipe_of_the_simulator_however_they_are_read(
-    name: str, file: str, grasps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The opened pack decides: in Python, and in `mvitac pretrain`, where single fields still come after the recipe."""
+def test_recipe_of_grasps(name: str, file: str, grasps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """That of the simulator, however they are read, in `mvitac pretrain` too, where single fields come after it."""
     config = find(DatasetConfig, name)(size=32, path=grasps / file)
     for one in RECIPES:
         expected, found = recipe(one, GraspsConfig()), recipe(one, config)

@@ -144,9 +144,7 @@ def test_compare_says_where_runs_differ(pack: Pack, tmp_path: Path, hardware: Ma
     assert "the networks of" not in markdown(same, lines)
 
 
-def test_a_bf16_export_needs_a_cpu_that_can_check_it(
-    smoke_run: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bf16_exports_need_a_cpu(smoke_run: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mvitac.deploy.export.has_bf16", lambda device: False)
     with pytest.raises(ValueError, match="--precision bf16: this CPU does not compute bf16 itself"):
         export(mvitac.load(smoke_run), pack, tmp_path / "e", ExportConfig(precision="bf16"))

@@ -73,10 +73,8 @@ def flip(path: Path) -> None:
     path.write_bytes(data)
 
 
-def test_a_damaged_checkpoint_gives_way_to_the_one_before(
-    pack: Pack, smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """One flipped bit among the weights. Once it is resumed and cut again, both are good ones."""
+def test_a_damaged_checkpoint(pack: Pack, smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Gives way to the one before: of one flipped bit. Once it is resumed and cut again, both are good ones."""
     out = tmp_path / "r"
     run = cut_after(5, pack, out)
     flip(out / CHECKPOINT)

@@ -88,10 +88,8 @@ def test_every_method_trains_two_and_leaves_a_locked_one(pack: Pack, file: Path,
 
 
 @pytest.mark.parametrize("name", ["mvitac", "supervised"])
-def test_a_locked_trunk_sees_each_whole_image_once(
-    pack: Pack, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    """The run is the one whose trunk sees it at every step, to rounding, and resumes bit for bit. Probes read the same."""
+def test_a_locked_trunk(pack: Pack, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """Sees each whole image once: as if at every step, to rounding, and resumed bit for bit. Probes read the same."""
     whole = ViewAugment(scale=(1.0, 1.0), flip=0.0, grayscale=0.0, size=24)
     run = started(pack, file, locked=True, pool="stages")
     run = replace(run, method=small(name), augment=replace(SIZES, vision=whole))
