@@ -182,9 +182,7 @@ def test_the_same_suite_twice_gives_the_same_digest_and_continues(
     assert {part.name.partition("-")[0] for part in (tmp_path / "parts").iterdir()} == {"controls"}
 
 
-def test_controls_of_the_data_that_changed_are_scored_again(
-    results: list[Path], smoke_run: Path, root: Path, tmp_path: Path
-) -> None:
+def test_controls_of_changed_data_are_redone(results: list[Path], smoke_run: Path, root: Path, tmp_path: Path) -> None:
     """A pack's digests of images and rows have no controls; a page does not mix both."""
     toys, out = find_suite(str(root / "toys.toml")), shutil.copytree(root, tmp_path / "root")
     pack = Pack(out / "stripes")
@@ -373,6 +371,7 @@ def no_touch(value: dict[str, Any]) -> None:
 
 RECORDS, VALUES = ("blocks", 0, "records"), ("blocks", 1, "records", 0)
 MORE_CORRECT = put(*RECORDS, 0, "sums", "correct", 0, value=1000)
+LUMEN, WIDTH = ({"name": "folder"} | own for own in ({"values": ["light=lumen:lm"]}, {"controls": ["width = w,h"]}))
 FEW, NO_VISION, NO_TOUCH = "30 % of labels", "the encoder has no vision", "the encoder has no touch"
 
 
@@ -393,10 +392,7 @@ FORGED: dict[str, tuple[Change, str]] = {
     "large squares": (put(*VALUES, "sums", "squared_error", 0, 0, value=1e9), "squared errors are smaller or larger"),
     "unit": (put(*VALUES, "targets", 0, 1, value="kN"), "is scored on other rows"),
     "data": (put("blocks", 1, "data", "rows", value="0" * 64), "its data or groups are not those of the set's other"),
-    "groups": (
-        put("blocks", 1, "group_by", value="frame"),
-        "its data or groups are not those of the set's other tasks",
-    ),
+    "groups": (put("blocks", 1, "group_by", value="frame"), "its data or groups are not those of the set's other"),
     "licence": (put("encoder", "licence", value={}), "licence is no text"),
     "infinity": (put(*VALUES, "sums", "error", 0, 0, value=1e999), "is not finite"),
     "no sums": (put(*RECORDS, 0, "sums", value={}), "its sums"),
@@ -429,15 +425,9 @@ FORGED: dict[str, tuple[Change, str]] = {
     "leaks by name": (put("blocks", 0, "leaks", value={"a": 1}), "a leak mark, a note, a group or what"),
     "rows in floats": (put(*RECORDS, 0, "sums", "n", 0, value=float), "its sums are no numbers"),
     "no features": (put("encoder", "features", value={}), "its features and parameters are of other senses"),
-    "unit of the suite": (
-        partial(own_data, {"name": "folder", "values": ["light=lumen:lm"]}),
-        r"its values are .*, those of the suite \[\['lumen', 'lm'\]\]",
-    ),
+    "unit of the suite": (partial(own_data, LUMEN), r"its values are .*, those of the suite \[\['lumen', 'lm'\]\]"),
     "errors in another unit": (other_unit, "its errors are not those of one answer"),
-    "control of the data": (
-        partial(own_data, {"name": "folder", "controls": ["width = w,h"]}),
-        "lacks width, none, linear, None",
-    ),
+    "control of the data": (partial(own_data, WIDTH), "lacks width, none, linear, None"),
     "values of simulated data": (simulated_values, r"its values are .*, those of the suite \[\['force_n', 'N'\]\]"),
     "control of simulated data": (partial(own_data, {"name": "grasps"}), "lacks contact only, none, linear"),
     "note": (put("blocks", 0, "notes", value=[5]), "a leak mark, a note, a group or what groups are is no text"),
@@ -449,10 +439,7 @@ FORGED: dict[str, tuple[Change, str]] = {
     "no reason": (no_vision, "stripes, pattern: both cannot be left out because x"),
     "no reason for a task": (lambda value: not_run(value["blocks"][1]), "touch cannot be left out because no time"),
     "untrue of a set": (lambda value: not_run(value["blocks"][1], "the encoder takes"), "light: touch cannot be left"),
-    "windows of a set": (
-        other_frames,
-        "stripes, pattern: touch and both cannot be left out because the encoder takes windows",
-    ),
+    "windows of a set": (other_frames, "pattern: touch and both cannot be left out because the encoder takes windows"),
     "weights of no digest": (put("encoder", "weights", value=[1]), "a digest of weights is none"),
     "no versions": (put("versions", value=None), "its versions are no texts"),
     "simulated": (simulated, "elsewhere, pattern: vision cannot be left out because .*elsewhere is not there"),
@@ -496,15 +483,11 @@ def blind_pixels(value: dict[str, Any]) -> None:
         record["sums"]["correct"] = [0] * len(record["sums"]["n"])
 
 
-def test_what_a_result_says_of_rows_and_of_leaks_is_compared(
-    results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rows_and_leaks_are_compared(results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     forged = changed(results[1], tmp_path / "a.json", more_spread, signed=True)
     assert main(["bench", "check", str(forged)]) == 0
     assert "the control mean differs between" in said(capsys, "bench", "board", results[0], forged)
-    nothing = partial(
-        untrained_as, lambda one, other: one is other if "targets" in other else one["modality"] == "none"
-    )
+    nothing = partial(untrained_as, lambda a, b: a is b if "targets" in b else a["modality"] == "none")
     assert main(["bench", "check", str(changed(results[1], tmp_path / "a.json", nothing, signed=True))]) == 0
     forged = changed(results[1], tmp_path / "a.json", blind_pixels, signed=True)
     assert main(["bench", "check", str(forged)]) == 0
@@ -591,9 +574,7 @@ def test_results_of_other_suites_are_refused(
     assert "is of another toys than toys of this" in said(capsys, "bench", "check", results[0])
 
 
-def test_encoders_that_cannot_be_scored_are_refused(
-    smoke_run: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_encoders_are_refused(smoke_run: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     model = load(smoke_run)
     run, spec = model.run, model.spec
     bench = "--suite", root / "toys.toml", "--data-root", root, "--out", tmp_path / "out"
@@ -627,9 +608,7 @@ def test_another_encoder_does_not_replace_a_result(results: list[Path], root: Pa
         run_bench(same, toys, results[0].parent, root, About())
 
 
-def test_stacked_sensors_are_read_one_by_one(
-    tmp_path: Path, smoke_run: Path, root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stacked_gels_one_by_one(tmp_path: Path, smoke_run: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     toy_pack(tmp_path / "stripes", touch_channels=6)
     opened = open_set(find_suite(str(root / "toys.toml")).sets[1], tmp_path)
     assert not isinstance(opened, str)
@@ -678,10 +657,7 @@ def test_shipped_suites_keep_their_definitions() -> None:
         (SUITE.replace(FORM, f'{FORM}\npins = {{ rows = "0" }}', 1), "form 'pack' has pins, .* leave them out"),
         (SUITE.replace("title = ", r'title = "\u0007" #', 1), "is not a suite .control character"),
         (SUITE.replace('"folded"', '"stripes"'), "of stripes, stripes, elsewhere one is there twice"),
-        (
-            SUITE.replace("labels = [0.3]", "labels = [0.3, 0.3]"),
-            "task 'pattern': give touch, vision or both, and nothing",
-        ),
+        (SUITE.replace("labels = [0.3]", "labels = [0.3, 0.3]"), "'pattern': give touch, vision or both, and nothing"),
         (SUITE.replace('"toys"', '"sim-v1"'), "sim-v3 of this version is another suite: give it another name"),
         (SUITE.replace(RANDOM.format(1), RANDOM.format(1) + ",reads=touch"), "which reads both"),
         (SUITE.replace('"clone" }', '"../clone" }', 1), "not a place below --data-root"),

@@ -263,9 +263,8 @@ def test_result_and_tables_agree(done: tuple[Path, dict]) -> None:
         ("touch-and-go (official)", "paper", "two rows of a touch", False),
     ],
 )
-def test_printed_numbers_stand_beside_the_same_split_probe_and_positives(
-    done: tuple[Path, dict], data: str, probe: str, pairs: str, shown: bool
-) -> None:
+def test_where_printed_numbers_stand(done: tuple[Path, dict], data: str, probe: str, pairs: str, shown: bool) -> None:
+    """Beside scores of the same split, probe and positives."""
     result = json.loads(json.dumps(done[1]))
     result["plan"] |= {"printed_on": "touch-and-go (official)", "printed_majority": {"pattern": 18.6}}
     result["plan"] |= {"probes": [probe]}
@@ -326,9 +325,7 @@ def test_a_run_that_diverges_is_told_and_the_rest_goes_on(pack: Pack, tmp_path: 
 
 
 @pytest.mark.parametrize("stop", [Interrupted("stopped after step 3"), KeyboardInterrupt()])
-def test_ctrl_c_begins_no_other_run(
-    pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: BaseException
-) -> None:
+def test_ctrl_c_begins_no_run(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: BaseException) -> None:
     """Of the run under way, training saves a checkpoint: ``test_ctrl_c_saves_and_is_told``."""
     work = lay_out(small(pack, seeds=1), pack, tmp_path, ProbeConfig(controls=False))
     monkeypatch.setattr(jobs, "train", begun := Mock(side_effect=stop))
@@ -417,9 +414,7 @@ def test_tables_say_where_pairs_are_from(done: tuple[Path, dict], pack: Pack) ->
         assert f"| {other} |" in text
 
 
-def test_cost_counts_images_and_seconds_and_notes_of_the_data_stand_beside_it(
-    done: tuple[Path, dict], pack: Pack
-) -> None:
+def test_cost_counts_images_and_seconds_and_notes_stand_beside_it(done: tuple[Path, dict], pack: Pack) -> None:
     out, result = done
     by_row = {c["row"]: c for c in result["cost"]}
     assert by_row["MViTac"]["images"] == 4 * 16 * 2 * 2 and by_row["supervised, touch"]["images"] == 4 * 16

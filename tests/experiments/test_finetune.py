@@ -107,23 +107,18 @@ def test_a_gain_over_few_groups_has_no_interval(capsys: pytest.CaptureFixture[st
     for num, shown in ((2, 2), (20, 4)):
         known: dict[str, Any] = {"task": "kind", "modality": "touch", "probe": "linear", "fraction": 100.0, "seed": 0}
         known |= {"group_sizes": [10] * num, "accuracy": 0.5, "leak": ""}
-        records = [
-            known | {"source": s, "group_correct": [k] * num} for s, k in ((TUNED, 4), (SCRATCH, 6), (FROZEN, 5))
-        ]
+        right = {TUNED: 4, SCRATCH: 6, FROZEN: 5}
+        records = [known | {"source": name, "group_correct": [k] * num} for name, k in right.items()]
         print_finetuning({"data": "d", "group_by": "object", "notes": [], "records": records})
         gains = [line for line in capsys.readouterr().out.splitlines() if line.startswith("gain")]
         assert sum(line.count("[") for line in gains) == shown - 2, gains
 
 
-@pytest.mark.parametrize(
-    ("num", "right", "says"),
-    [
-        (3, 9, "cannot be told with under 10 objects in test (3)"),
-        (20, 9, "mvitac publish"),
-        (20, 5, "no gain"),
-        (20, 0, "no"),
-    ],
-)
+UNSURE = "cannot be told with under 10 objects in test (3)"
+NEXT = [(3, 9, UNSURE), (20, 9, "mvitac publish"), (20, 5, "no gain"), (20, 0, "no")]
+
+
+@pytest.mark.parametrize(("num", "right", "says"), NEXT)
 def test_only_a_sure_gain_is_published(num: int, right: int, says: str) -> None:
     """Of 10 rows in each group, the frozen probe has 5 right, and 4 or 6 in some."""
     known: dict[str, Any] = {"task": "kind", "fraction": 100.0, "seed": 0, "group_sizes": [10] * num, "accuracy": 0.5}
@@ -241,9 +236,8 @@ def test_what_was_tried_on_other_labels_is_tried_again(ancestor: Path, pack: Pac
 SWAPPED = {"test": "train", "train": "test", "val": "val"}
 
 
-def test_bad_input_is_refused_before_anything_is_written(
-    ancestor: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_is_refused(ancestor: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Before anything is written."""
     out, run = tmp_path / "out", str(ancestor)
     first = {"label_pattern": lambda row: row["label_pattern"] * (row["split"] == "test")}
     three = {"group": lambda row: row["split"] + str(row["label_pattern"]) * (row["split"] == "train")}
