@@ -62,11 +62,9 @@ class SlipGSMiniConfig(RowsConfig):
             place = folder.relative_to(root)
             known = {
                 **{finger: (place / video).as_posix() for finger, video in FINGERS.items()},
-                "experiment": place.as_posix(),
-                "object": name,
+                **{"experiment": place.as_posix(), "object": name},
                 "slip": str(int(slips.pop())) if len(slips) == 1 else "",
-                "n_frames": str(length),
-                "copies": str(len(folders)),
+                **{"n_frames": str(length), "copies": str(len(folders))},
                 "author_split": "train" if "train" in sides else "val" if sides else "extra",
             }
             known["label_conflict"] = str(int(not known["slip"]))

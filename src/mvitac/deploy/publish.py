@@ -90,9 +90,7 @@ def _scores(run: Path, model: Model, pack: Pack, records: Records) -> dict[str, 
     else:
         controls = _controls(model, pack, records)
     return {
-        "data": pack.spec.name,
-        "group_by": pack.spec.group_by,
-        "notes": list(pack.spec.notes),
+        **{"data": pack.spec.name, "group_by": pack.spec.group_by, "notes": list(pack.spec.notes)},
         "leaks": mark_split_leaks(pack, [*records, *controls]),
         "summary": summarise([*({**own, **record} for record in records), *controls]),
     }

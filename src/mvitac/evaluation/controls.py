@@ -97,12 +97,11 @@ def controls_of(
 
 def _untrained(run: Run, runs: Sequence[Run]) -> Run:
     """``run`` from random weights; a tower that all ``runs`` lock, so none trains, has its own if they are here."""
-
-    def is_there(config: EncoderConfig) -> bool:
-        return bool(imagenet.source(config.trunk)) if config.weights == IMAGENET else Path(config.weights).is_file()
-
-    locked = [m for m in MODALITIES if all(each.encoder[m].locked for each in runs)]
-    kept = {m: run.encoder[m] for m in locked if is_there(run.encoder[m])}
+    locked = {m: run.encoder[m] for m in MODALITIES if all(each.encoder[m].locked for each in runs)}
+    here = {
+        m: imagenet.source(c.trunk) if c.weights == IMAGENET else Path(c.weights).is_file() for m, c in locked.items()
+    }
+    kept = {m: config for m, config in locked.items() if here[m]}
     return replace(run, encoder=replace(run.encoder.fresh(), **kept))
 
 

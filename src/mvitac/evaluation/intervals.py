@@ -85,7 +85,7 @@ def paired_difference(
 def mean_interval(values: np.ndarray, *, level: bool = False) -> tuple[float, float, float, float]:
     """Mean of ``values`` [seeds, groups], its 95 % interval over both (endless for one group), the p of a mean of 0.
 
-    They are differences, whose interval holds 0 where p is always above .05, or of a ``level``, which 0 says nothing of.
+    They are differences, or a ``level``, whose interval need not hold 0 where p is always above .05.
     """
     if values.shape[1] < 2:
         return float(values.mean()), -math.inf, math.inf, 1.0
@@ -190,7 +190,6 @@ def _over_seeds(correct: np.ndarray, sizes: np.ndarray) -> _Variance:
 
 
 def _margin(groups: _Variance, seeds: _Variance) -> float:
-    """Half the width of the 95 % interval."""
     return max(float(stdtrit(v.freedom, 0.975)) * v.value**0.5 for v in (groups + seeds, seeds))
 
 
@@ -204,7 +203,6 @@ def _margin_and_p(mean: float, groups: _Variance, seeds: _Variance, num_groups: 
 
 
 def _p(mean: float, variance: _Variance) -> float:
-    """Two-sided p of a mean by Student's t."""
     if not variance.value:
         return float(mean == 0)
     return 2 * float(stdtr(variance.freedom, -abs(mean) / variance.value**0.5))

@@ -46,8 +46,8 @@ def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
     for c in result["cost"]:
         numbers = [str(c[key]) for key in ("row", "pairs_of", "seeds", "steps", "pairs", "images")]
         rows.append([*numbers, f"{c['trained_parameters'] / 1e6:.2f} M", f"{c['seconds']:.0f}"])
-    whole = "\n".join([*text, *pipes(heads, rows)]).rstrip() + "\n"
-    return re.sub("<(?=[A-Za-z/!])", "&lt;", whole)  # names of the data are no HTML
+    # Names of the data are no HTML.
+    return re.sub("<(?=[A-Za-z/!])", "&lt;", "\n".join([*text, *pipes(heads, rows)]).rstrip() + "\n")
 
 
 def _tables(result: dict[str, Any], lines: Sequence[Line]) -> Iterator[tuple[str, list[str], list[list[str]]]]:

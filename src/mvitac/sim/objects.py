@@ -159,11 +159,7 @@ _DRAW = {
     "rod": _single("cylinder", (12, 24), (38, 78), lying=True),
     "ellipsoid": _single("ellipsoid", (16, 30), (26, 58), (15, 28)),
     "capsule": _single("capsule", (13, 25), (22, 55), lying=True),
-    "hammer": _hammer,
-    "mug": _mug,
-    "bottle": _bottle,
-    "tee": _tee,
-    "dumbbell": _dumbbell,
+    **{draw.__name__[1:]: draw for draw in (_hammer, _mug, _bottle, _tee, _dumbbell)},
 }
 """Shape kind -> function that draws its parts, which stand on z = 0."""
 KINDS = tuple(_DRAW)  # shape kinds. Objects cycle through them, so that every split by object has all kinds.

@@ -38,6 +38,10 @@ class Sensor:
     held_out: bool = False  # not used for training data; it tests transfer to a new sensor
 
 
+def _dots(pitch_mm: float, radius_mm: float, **more: float) -> dict[str, Any]:
+    return {f"marker_{name}": value for name, value in {"pitch_mm": pitch_mm, "radius_mm": radius_mm, **more}.items()}
+
+
 SENSORS: dict[str, Sensor] = {
     s.name: s
     for s in (
@@ -59,10 +63,7 @@ SENSORS: dict[str, Sensor] = {
             tilt=((2, 12), (-8, -6), (3, -18)),
             response=((95, 130), (-80, -25), (20, -150)),
             saturation=60,
-            marker_pitch_mm=1.9,
-            marker_radius_mm=0.36,
-            marker_jitter=0.025,
-            marker_wear=0.2,
+            **_dots(1.9, 0.36, jitter=0.025, wear=0.2),
             dirt=8,
             edge=0.25,
         ),
@@ -73,11 +74,7 @@ SENSORS: dict[str, Sensor] = {
             tilt=((6, 7), (4, 6), (-8, -13)),
             response=((85, 65), (12, -100), (-90, 60)),
             saturation=46,
-            marker_pitch_mm=1.7,
-            marker_radius_mm=0.16,
-            marker_jitter=0.11,
-            marker_wear=0.85,
-            marker_angle_deg=14,
+            **_dots(1.7, 0.16, jitter=0.11, wear=0.85, angle_deg=14),
             shadow=0.15,
             dirt=16,
             scratches=2.0,
@@ -104,11 +101,7 @@ SENSORS: dict[str, Sensor] = {
             tilt=((10, -5), (0, 6), (-10, 3)),
             response=((105, -45), (35, 95), (-100, -30)),
             saturation=50,
-            marker_pitch_mm=1.55,
-            marker_radius_mm=0.2,
-            marker_jitter=0.06,
-            marker_wear=0.45,
-            marker_angle_deg=-27,
+            **_dots(1.55, 0.2, jitter=0.06, wear=0.45, angle_deg=-27),
             dirt=8,
             scratches=1.5,
             edge=0.35,
