@@ -131,11 +131,8 @@ def suite_episodes(suite: Any, cell: tuple[str, ...]) -> Episodes:
 
 def suite_policy(suite: Any, cell: tuple[str, ...], text: str) -> Policy:
     """A policy that ``open_policy`` takes; or that of an encoder, or of "pixels", which learns as rows of the suite do."""
-    if (
-        (Path(text) / "config.json").is_file()
-        or text.endswith(".py")
-        or (":" in text and not text.startswith("external:"))
-    ):
+    code = text.endswith(".py") or (":" in text and not text.startswith("external:"))
+    if code or (Path(text) / "config.json").is_file():
         return open_policy(text)
     learn = ridge(pixels if text == "pixels" else encoding(load(text)))
     estimate, world = learn(*suite.taught(suite.lesson(cell))), suite.world(*cell, 0)

@@ -59,9 +59,8 @@ def _grasps(root: Path, file: Path) -> list[dict[str, str]]:
         words = line.split()
         if not words:
             continue
-        # The seventh is a folder of the object's own.
-        numbers = [number_of(words[i]) for i in (0, 5)] if len(words) == 8 and "/" not in words[6] else [None]
-        if None in numbers or words[2] not in ("0", "1") or not words[5].isdecimal():
+        good = len(words) == 8 and number_of(words[0]) is not None and words[5].isdecimal()
+        if not good or words[2] not in ("0", "1") or "/" in words[6]:  # the folder, which is one of the object's
             raise ValueError(f"{file} line {number}: {line!r} is not a grasp of eight words")
         width, _, success, _, _, key, folder, _ = words
         pairs: dict[int, dict[str, str]] = defaultdict(dict)
