@@ -21,6 +21,7 @@ from mvitac.data.checks.value_checks import time_shift
 from mvitac.data.pack import Pack
 from mvitac.data.stamps import seconds
 from mvitac.datasets.folder import FolderConfig
+from mvitac.datasets.table.clocks import times_of
 from support.videos import film, picture, shade, write_video
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "wedge_force" / "manifest.csv"
@@ -232,6 +233,9 @@ def test_a_table_of_videos_takes_the_times_beside_them_and_elements_of_lists_fro
     """The camera ran at half the rate that its file says."""
     for k in range(3):
         film(tmp_path / f"{k}/gel.mp4", 50, which=k)
+        (tmp_path / f"{k}/gel_timestamps.txt").write_bytes(b"0.0 \xe9")
+        with pytest.raises(ValueError, match=r"gel_timestamps\.txt: .* is no time"):
+            times_of(tmp_path / f"{k}/gel.mp4")
         (tmp_path / f"{k}/gel_timestamps.txt").write_text("\n".join(str(0.08 * i) for i in range(50)))
         rows = [{"stamp": t, "wrench": [0, force(t)]} for t in np.arange(-1, 5, 0.01).tolist()]
         (tmp_path / f"{k}/force.jsonl").write_text("\n".join(map(json.dumps, rows)))

@@ -15,8 +15,9 @@ from sklearn.neighbors import NearestNeighbors
 from mvitac.cli.main import main
 from mvitac.data.images import fit
 from mvitac.data.pack import Pack
-from mvitac.deploy.search import Embeddings, nearest, unit
+from mvitac.deploy.search import Embeddings, embed, nearest, unit
 from mvitac.model import Model
+from support.toy import toy_pack
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +54,11 @@ def test_a_row_finds_itself_and_both_directions_work(known: Path, pack: Pack, mo
     expected = np.argsort(-(both["touch"] @ both["vision"].T).numpy(), axis=1, kind="stable")[:, :3]
     assert np.array_equal(opened.find(model, pack.images["touch"][:4], "touch", "vision", 3)[0], expected)
     assert opened.labels(0)["pattern"] == pack.spec.tasks[0].classes[pack.column("label_pattern")[0]]
+
+
+def test_rows_of_another_size_than_a_query_has_are_refused(artifact: Path, tmp_path: Path, model: Model) -> None:
+    with pytest.raises(ValueError, match="has images of 24 px: pack it again with --size 32"):
+        embed(model, toy_pack(tmp_path / "small", size=24), tmp_path / "e.parquet")
 
 
 def test_find_command_draws_what_it_found(

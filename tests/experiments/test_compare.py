@@ -409,9 +409,11 @@ def test_tables_say_where_pairs_are_from(done: tuple[Path, dict], pack: Pack) ->
     for other in ("one row", "two rows of a touch"):
         costs = [{**c, "pairs_of": other if c["row"] == "MViTac" else "one row"} for c in done[1]["cost"]]
         text = markdown({**done[1], "cost": costs, "data": "<script>"}, lines_of(done[1]))
-        assert "Data &lt;script>" in text
+        assert "Data &lt;script>" in text and "Too few" not in text
         assert ("**pairs are not from the same rows (see cost)**" in text) == (other != "one row")
         assert f"| {other} |" in text
+    next(iter((lines := lines_of(done[1]))[0].cells.values())).update(low=None, high=1.0)
+    assert "Controls are in italics. Too few test" in markdown(done[1], lines)
 
 
 def test_cost_counts_images_and_seconds_and_notes_stand_beside_it(done: tuple[Path, dict], pack: Pack) -> None:

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -512,6 +513,21 @@ def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys:
     refused = ["--record", str(tmp_path / "r"), "--background", *[str(tmp_path / "touch" / "000.png")] * 2]
     assert main([*command, *refused]) == 2 and "2 background(s) for 1 touch" in capsys.readouterr().err
     assert not list(tmp_path.glob("r.*"))  # nothing is in the way of the next try
+
+
+def test_what_was_recorded_is_kept_when_stdout_is_full(
+    onnx: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines, place = iter(range(40)), os.open(os.devnull, os.O_WRONLY)
+
+    def write(text: str) -> None:
+        if next(lines, None) is None:
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("sys.stdout", Mock(write=write, fileno=lambda: place))
+    words = ["--always", "--calibration", "2", "--record", str(tmp_path / "r"), "--json", str(tmp_path / "s.json")]
+    assert main(["live", str(onnx), *words]) == 0 and Pack(tmp_path / "r").num > 0 and (tmp_path / "s.json").is_file()
+    assert "stopped: stdout: No space left on device" in capsys.readouterr().err
 
 
 def test_sigterm_ends_it_as_ctrl_c_does(

@@ -240,7 +240,6 @@ def _encoders(board: Board) -> list[Markup]:
 
 
 def _leaks(result: dict[str, Any]) -> str:
-    """The leak column: LEAK with the tasks, LEAK? or "none found"."""
     marks: dict[str, list[str]] = {}
     for block in result["blocks"]:
         for leak in dict.fromkeys(block.get("leaks", ())):

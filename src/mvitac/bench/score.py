@@ -28,7 +28,7 @@ from mvitac.evaluation.leaks import Scored, declared_leak, read_sources
 from mvitac.evaluation.probe import names_in, probe_all, split_rows
 from mvitac.evaluation.scores import pool
 from mvitac.model import Model
-from mvitac.system.files import digest, read_json, write_json
+from mvitac.system.files import digest, fields_of, read_json, write_json
 from mvitac.system.progress import work
 from mvitac.system.provenance import provenance
 
@@ -197,7 +197,10 @@ def _block(
 
 def kept_part(parts: Path, key: str, about: list[Any], score: Callable[[], Records]) -> Records:
     """The records of a part of a result: those kept, else scored now and kept."""
-    path = parts / f"{key[:16]}-{digest([key, *about])[:24]}.json"
+    path = parts / f"{key[:16]}-{(of := digest([key, *about]))[:24]}.json"
     if not path.exists():
-        write_json(path, {"records": score()}, sealed=True)
-    return read_json(path, "a part of a bench")["records"]
+        write_json(path, {"of": of, "records": score()}, sealed=True)
+    part = read_json(path, "a part of a bench")
+    with fields_of(path):
+        assert part["of"] == of, "it is of another task, data or encoder"
+        return part["records"]

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import signal
 import sys
 import threading
@@ -142,7 +143,12 @@ def _run(loop: Live, seconds: float | None) -> None:
             if said := loop.step():
                 line = json.dumps({"time": loop.clock() - start, **said})
                 short = json.loads(line, parse_float=lambda text: float(f"{float(text):.6g}"))
-                print(json.dumps(short), flush=True)
+                try:
+                    print(json.dumps(short), flush=True)
+                except OSError as error:  # whoever read it has enough, or its disk is full: what was recorded is kept
+                    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                    _say(f"stopped: stdout: {error.strerror}")
+                    break
     except KeyboardInterrupt:
         _say("stopped")
     finally:
@@ -197,7 +203,11 @@ def predict(argv: list[str]) -> None:
             _say(f"mvitac: warning: {m} shows {have}, the model learned from {wanted}: pack it with --crop")
         _say_sensors(engine, pack.column("sensor") if "sensor" in pack.table.column_names else ("",))
         about = ("group", "split") if isinstance(config, PackConfig) else ()  # those of a new table mean nothing
-        if num := pack.num - _write(options.out, pack_tables(engine, pack, about), pack.num):
+        try:
+            num = pack.num - _write(options.out, pack_tables(engine, pack, about), pack.num)
+        except ValueError as error:  # nobody knows the cache's folder
+            raise ValueError(str(error).replace(str(pack.path), options.source or "")) from None
+        if num:
             _say(f"{num} of {pack.num} rows are left out: without an image that the model takes")
         return
     opened = dict.fromkeys(engine.inputs, single) if single else opened

@@ -19,7 +19,7 @@ from unittest.mock import patch
 import tyro
 
 from mvitac.shipped import named
-from mvitac.system.files import check_place, write_json
+from mvitac.system.files import check_place, naming, write_json
 
 T = TypeVar("T")
 STDOUT = Path("-")  # the --json FILE that means stdout
@@ -137,7 +137,8 @@ def printed_to(json_file: Path | None) -> TextIO:
 def save_json(path: Path | None, value: Any, *, sealed: bool = False) -> None:
     """Write ``value`` to the file of a ``--json`` option, if it was given, and say so."""
     if path == STDOUT:
-        print(json.dumps(value, indent=1, allow_nan=False))
+        with naming(Path("stdout")):
+            print(json.dumps(value, indent=1, allow_nan=False), flush=True)
     elif path:
         write_json(path, value, sealed=sealed)
         print(f"written: {path}")

@@ -40,7 +40,6 @@ def film(episodes: Episodes, runs: Sequence[Run]) -> list[Image.Image]:
 def _trace(
     picture: Image.Image, at: tuple[int, int], title: str, errors: np.ndarray, step: int, most: np.ndarray
 ) -> None:
-    """Errors [steps, 2] up to ``step``, in parts of the most of all runs."""
     draw = ImageDraw.Draw(picture)
     draw.text((at[0] + 6, at[1] + 2), title, "black")
     for line, (unit, colour) in enumerate((("mm", "#0072b2"), ("°", "#d55e00"))):

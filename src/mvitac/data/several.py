@@ -29,7 +29,6 @@ class _Several(Pack):
     """Rows of packs one after another; a subclass sets ``path``, ``table``, ``spec``, ``size`` and ``digests``."""
 
     def _open(self, packs: Sequence[Pack]) -> None:
-        """Show the images of ``packs``, one pack after another; spec and size are set."""
         self._packs, self.store, self.num = packs, "raw", sum(pack.num for pack in packs)
         starts = np.cumsum([0, *(pack.num for pack in packs)])
         pieces = {m: [pack.images.get(m) for pack in packs].__getitem__ for m in self.spec.modalities}

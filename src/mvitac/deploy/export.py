@@ -53,9 +53,8 @@ def export(
     if new and "touch" not in asked:
         raise ValueError(f"{NEW_SENSOR} is about touch, which this export lacks: leave it out")
     for given in (known, pack):
-        if {*fitting(model, given, asked, in_use=True)} != {*asked} or given.size != model.stored:
-            what = f"{' and '.join(asked)} at {model.stored} px"
-            raise ValueError(f"{given.path} cannot check this model: it needs images of {what}")
+        if {*fitting(model, given, asked, in_use=True)} != {*asked}:
+            raise ValueError(f"{given.path} cannot check this model: it needs images of {' and '.join(asked)}")
     graph = ExportModule(model, asked, learn_looks(known, new, NEW_SENSOR) if new else None)
     rows = pack.rows("test", having=asked)
     if not len(rows):  # of a recording

@@ -43,8 +43,6 @@ def fit_probes(model: Model, pack: Pack) -> list[tuple[LinearProbe, dict[str, An
     That of values is ridge regression. A task without labelled rows in train and test has none: it could not be scored.
     """
     modalities = fitting(model, pack, in_use=True)
-    if pack.size != model.stored:  # images in use are shrunk to that first: features would be others
-        raise ValueError(f"{pack.path} has images of {pack.size} px: pack it again with --size {model.stored}")
     tasks = {m: scorable(pack, m) for m in (*modalities, *(["both"] if len(modalities) == 2 else []))}
     records: Records = []
     fitted: FittedProbes = {}
@@ -75,7 +73,6 @@ def _as_published(pack: Pack, task: AnyTask, record: dict[str, Any], fitted: Any
 
 
 def _error(target: dict[str, Any], true: np.ndarray, guess: np.ndarray) -> Error:
-    """The errors of one target, with their spread by range of the predicted value."""
     ranges = error_by_range(guess, guess - true, max(1, min(NUM_RANGES, len(true) // RANGE_ROWS)))
     edges, spread = tuple(each["low"] for each in ranges[1:]), tuple(each["rmse"] for each in ranges)
     return Error(**{key: float(target[key]) for key in ("r2", "mae", "rmse")}, edges=edges, spread=spread)

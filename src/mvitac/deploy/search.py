@@ -29,7 +29,7 @@ def embed(model: Model, pack: Pack, file: Path, *, shared: bool = False) -> pa.T
     rows = np.arange(pack.num)
     names = ["id", "group", "split", *(f"label_{task.name}" for task in pack.spec.tasks)]
     table = pack.table.select(names).append_column("row", pa.array(rows, pa.int64()))
-    for modality in fitting(model, pack):
+    for modality in fitting(model, pack, in_use=True):  # a query's image is in use
         have = pack.has(modality)[rows]
         x = features(model, pack, modality, rows[have], for_heads=shared)
         if shared:

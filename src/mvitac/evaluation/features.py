@@ -32,7 +32,7 @@ def sample(rows: np.ndarray, num: int, rng: np.random.Generator | None = None) -
 def fitting(model: Model, pack: Pack, among: Sequence[str] = MODALITIES, *, in_use: bool = False) -> tuple[str, ...]:
     """Those ``among`` modalities that model and pack have in common; ValueError if there are none, or images do not fit.
 
-    ``in_use``: nor do difference images, where the model will be given plain ones.
+    ``in_use``: nor do difference images, where the model will be given plain ones, nor images of another stored size.
     """
     names = tuple(m for m in pack.spec.modalities if m in model.encoders and m in among)
     for modality in names:
@@ -43,6 +43,8 @@ def fitting(model: Model, pack: Pack, among: Sequence[str] = MODALITIES, *, in_u
         raise ValueError(f"{pack.path}: the model was trained on difference images: pack with --subtract-background")
     if in_use and "touch" in names and pack.spec.difference and not model.spec.difference:
         raise ValueError(f"{pack.path}: the model was trained without difference images: no --subtract-background")
+    if in_use and pack.size != model.stored:  # images in use are resized to that first: features would be others
+        raise ValueError(f"{pack.path} has images of {pack.size} px: pack it again with --size {model.stored}")
     if not names:
         raise ValueError(f"{pack.path} has {', '.join(pack.spec.modalities)}, the model {', '.join(model.encoders)}")
     return names

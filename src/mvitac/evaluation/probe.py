@@ -211,7 +211,6 @@ def own_heads(
 
 
 def _outputs(task: AnyTask) -> tuple[Any, ...]:
-    """What the outputs of a head stand for: names of classes, or targets with their units."""
     return task.classes if isinstance(task, Task) else task.targets
 
 

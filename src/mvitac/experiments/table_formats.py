@@ -95,12 +95,14 @@ def _p(p: float) -> str:
 def _preface(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> list[str]:
     seeds = max((c["seeds"] for c in result["cost"]), default=0)
     scores = dict.fromkeys("R2" if "targets" in record else "accuracy" for record in result["records"])
+    bare = any("[" not in with_interval(c["mean"], c["low"], c["high"]) for line in lines for c in line.cells.values())
+    few = f" Too few test {result['group_by']}s for some intervals." * bare
     probes = " or ".join(dict.fromkeys(probe_name(plan.probes[0], score) for score in scores))
     text = [
         f"Data {result['data']} (pack {result['pack'][:12]}), recipe {plan.recipe}, {seeds} seed{'s' * (seeds != 1)},"
         f" {_budget(result)}; {probes} on frozen features; {_made(result)}.",
         f"95 % intervals: {covered(result['group_by'], result['records'])}. {_significance(result, plan, lines)}"
-        " Controls are in italics.",
+        f" Controls are in italics.{few}",
     ]
     if plan.folds:
         unseen = "" if result["leaks"] else ", by encoders and probes that never saw it"
@@ -130,7 +132,6 @@ def _significance(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> 
 
 
 def _notes(result: dict[str, Any]) -> list[str]:
-    """Notes of the data, and the runs whose precision differs from that of most runs."""
     precisions: dict[str, str] = result["run_precisions"]  # by name of the run
     if len(set(precisions.values())) < 2:
         return result["notes"]

@@ -64,7 +64,7 @@ def pack_tables(engine: Engine, pack: Pack, about: Sequence[str] = ("group", "sp
         have, takes = pack.images[modality].shape[1:], frame_shapes(engine)[modality]
         if have != takes:
             what = f"{pack.path} has images of {modality} of {have}, the model takes {takes}"
-            raise ValueError(f"{what}: pack the same sensors with --size {takes[0]}")
+            raise ValueError(f"{what}: name all its sensors (--{modality}), pack with --size {takes[0]}")
     if pack.spec.difference != engine.difference:
         raise ValueError(f"{pack.path}: touch minus its background, in the model or in the pack only")
     if engine.window:

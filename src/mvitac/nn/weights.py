@@ -154,7 +154,6 @@ def _say(line: str) -> None:
 
 
 def _starts(names: Iterable[str]) -> dict[str, None]:
-    """All beginnings of names that consist of ``PREFIXES``, the empty one first."""
     found = {"": None}
     for name in names:
         start = ""

@@ -49,7 +49,6 @@ def samples(pack: Pack) -> list[Block]:
 
 
 def _spread(rows: np.ndarray, groups: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draw ``NUM_SAMPLE`` of ``rows``, one of every group before a second of any."""
     order = rng.permutation(len(rows))
     turns: defaultdict[int, count[int]] = defaultdict(count)
     turn = [next(turns[group]) for group in groups[order].tolist()]

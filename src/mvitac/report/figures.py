@@ -81,7 +81,6 @@ def bars(
 
 
 def _bar(axes: Axes, y: float, source: str, cell: Mapping[str, Any], hue: str, least: float) -> None:
-    """One bar with its whisker, if it has one, and its value. Nothing is drawn below ``least``."""
     ends = [cell["low"], cell["high"]] if cell["low"] is not None else [cell["mean"]] * 2
     mean, low, high = (100 * max(least, value) for value in (cell["mean"], *ends))
     axes.barh(y, mean, 0.74, color=COLOURS[CONTROL_GREYS.get(source, hue)])
@@ -176,7 +175,6 @@ def predicted(title: str, points: Sequence[Sequence[float]], unit: str, hue: str
 
 @matplotlib.rc_context(STYLE)
 def _print(figure: Figure, kind: str, metadata: dict[str, Any], **options: Any) -> bytes:
-    """Print the figure. It is laid out once for all kinds of file; savefig alone would repeat that."""
     for axes in figure.axes:
         axes.set_facecolor("none")
     buffer = io.BytesIO()

@@ -102,7 +102,6 @@ def _bench(seed: int, obj: int) -> physics.Bench:
 
 
 def _latents(thing: objects.Thing, patch: skin.Patch, plan: physics.Plan) -> dict[str, float]:
-    """Return the inputs of the simulation, stored as columns of the pack."""
     low, high = thing.bounds
     _, along, above = (1000 * ((low + high) / 2 + plan.offset_m - thing.center_of_mass)).tolist()
     known = {"mass_kg": thing.mass, "friction": plan.friction, "force_n": plan.force_n}

@@ -176,7 +176,6 @@ def outline(x: F, y: F, rng: np.random.Generator, radius: float, curl: float) ->
 
 
 def _look(thing: Instance, rng: np.random.Generator, angle: float, place: Place, size: int) -> NDArray[np.uint8]:
-    """Render the object on a table with clutter under a lamp: uint8 [size, size, 3]."""
     x, y, pixel = grid(size, _CAMERA_MM * np.exp(rng.uniform(-0.25, 0.25)))
     width, curl = float(x.shape[0] * pixel), thing.curl
     inside = outline(x, y, rng, rng.uniform(0.42, 0.62) * width, curl)

@@ -133,7 +133,6 @@ class Bench:
         return 0
 
     def _touch(self, side: int) -> Touch:
-        """Return the sum of contact forces on a pad's dome."""
         total, force = np.zeros(3), np.zeros(6)
         for i in range(self.data.ncon):
             pair = self.data.contact.geom[i]

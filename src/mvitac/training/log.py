@@ -80,7 +80,6 @@ class Log:
             self.say(textwrap.fill(clause, WIDTH, subsequent_indent="    "))
 
     def _row(self, step: int, columns: dict[str, list[str]], values: dict[str, float]) -> None:
-        """Print a row of the table of evaluations, below its heads if it is the first."""
         widths = _widths(list(columns))
         if not self.begun:
             self.begun = True

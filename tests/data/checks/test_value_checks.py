@@ -101,6 +101,8 @@ def test_missing_values(tmp_path: Path) -> None:
     assert force.verdict == "ok" and "160 of 640 (25.0 %) rows of train, val and test have none" in force.evidence
     (force, _) = value_checks.values(packed(tmp_path / "b", "no test"))
     assert force.verdict == "broken" and "no row of test has a value" in force.evidence
+    scored = with_columns(pack := packed(tmp_path / "c", "missing"), split=["test"] * pack.num)  # to be scored alone
+    assert value_checks.values(scored)[0].verdict == "look"
 
 
 def test_a_stretch_of_zeros_is_no_contact(healthy: Pack) -> None:

@@ -28,7 +28,8 @@ def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, tou
     measured = {side: rows[np.isfinite(found[rows])] for side, rows in sides.items()}
     if lacking := [side for side, rows in measured.items() if not len(rows)]:
         evidence = f"no row of {' and '.join(lacking)} has a value"
-        return judged(item, evidence, "measure some or assign the splits again", broken=True)
+        broken = any(len(sides[side]) for side in lacking)  # else the pack has none such, to be scored alone
+        return judged(item, evidence, "measure some or assign the splits again", broken=broken)
     rows = np.sort(np.concatenate(list(measured.values())))
     known = found[rows]
     low, middle, high = np.percentile(known, [0, 50, 100])

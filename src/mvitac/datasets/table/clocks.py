@@ -42,7 +42,7 @@ def times_of(video: Path) -> np.ndarray:
         raise ValueError(f"{found[0]} and {found[1].name} both have the times of {video.name}: remove one")
     file = found[0]
     if file.suffix == ".txt":
-        stamps = seconds([line.strip() for line in file.read_text().splitlines() if line.strip()], file)
+        stamps = seconds([line.strip() for line in file.read_text(errors="replace").splitlines() if line.strip()], file)
     else:
         table = read_manifest(file)
         usual = next((name for name in STAMPS if name in table.columns), STAMPS[0])
@@ -149,7 +149,6 @@ def join(
 
 
 def _parsed(text: str) -> tuple[str, str, float]:
-    """Return file, column and shift in seconds of ``FILE:COLUMN-0.35``."""
     name, _, rest = text.rpartition(":")
     if not name or not rest:
         raise ValueError(f"log {text!r}: write FILE:COLUMN, where COLUMN has the time stamps")

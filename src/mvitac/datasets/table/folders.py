@@ -41,6 +41,8 @@ def list_images(root: Path, plain: str, every: int | None) -> Manifest:
     tables = sorted(file.name for file in root.iterdir() if file.suffix.lower() in READERS)
     beside = tuple(f"images are read without {name}: if it is their table, give it as --path" for name in tables)
     if all("label" in row for row in rows):
+        if {row["label"].lower() for row in rows} <= {*SPLITS}:
+            raise ValueError(f"{root}: its classes are named like splits, which are folders above vision and touch")
         if len({row["group"] for row in rows}) == len(rows):  # no groups, which results say
             rows = [{name: cell for name, cell in row.items() if name != "group"} for row in rows]
         return Manifest.of(root, rows, labels=("label",), notes=("each folder of images is a class", *beside))

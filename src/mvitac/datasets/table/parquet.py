@@ -81,7 +81,6 @@ def _there(opened: pq.ParquetFile, group: int, column: str, num: int) -> list[bo
 
 
 def _classes(schema: pa.Schema) -> dict[str, list[str]]:
-    """Return column -> class names, from the metadata of Hugging Face's datasets library."""
     try:
         features: dict[str, Any] = parse_json((schema.metadata or {})[b"huggingface"].decode())["info"]["features"]
     except (KeyError, ValueError):

@@ -91,12 +91,13 @@ def check_sides(
     """Check that there are rows to pre-train on and, for each task, labelled rows in train and test."""
     counts = Counter(splits)
     what = f"assigning {num} groups" if split == BY_GROUP else f"column {split!r}"
+    more = "give more groups" if split == BY_GROUP else f"--data.split {BY_GROUP} assigns whole groups"
     if not counts["train"] + counts["unlabelled"]:
         raise ValueError(f"{where}: {what} gives no rows of train or unlabelled: nothing to pre-train on")
     for task, target in zip(tasks, targets, strict=True):
         for side in ("train", "test"):
             if not any(label >= 0 and s == side for label, s in zip(target, splits, strict=True)):
-                raise ValueError(f"{where}: {what} gives {task.name!r} no rows in {side}: give more groups")
+                raise ValueError(f"{where}: {what} gives {task.name!r} no rows in {side}: {more}")
 
 
 def folds(groups: Sequence[str], strata: Sequence[str], num: int, val_every: int = 2) -> dict[str, list[str]]:
