@@ -194,9 +194,10 @@ def test_lerobot_says_what_is_missing(tmp_path: Path) -> None:
     refused(root, r"file-001\.mp4 is missing: fetch the videos too")
     (root / "data/chunk-000/file-001.parquet").write_text("no")
     refused(root, r"file-001\.parquet cannot be read as a table")
-    whole = (file := root / "data/chunk-000/file-000.parquet").read_bytes()
-    file.write_bytes(whole.replace(b"frame_inde", b"frame_ind\xc7"))
-    refused(root, r"file-000\.parquet cannot be read as a table")
+    pq.write_table(pa.table({"touch": [png(1)], "a": ["b"]}), file := tmp_path / "n.parquet")
+    file.write_bytes(file.read_bytes().replace(b"touch", b"touc\xc7"))
+    with pytest.raises(ValueError, match=r"n\.parquet cannot be read as a table: 'utf-8'"):
+        FolderConfig(path=file).source()
 
 
 def changed(root: Path, change: Callable[[dict[str, Any]], Any], file: str = "data/chunk-000/file-000") -> Path:
