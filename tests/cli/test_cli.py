@@ -12,6 +12,7 @@ from unittest.mock import Mock
 import pytest
 
 from mvitac.cli.main import _check_choices, help_file, main
+from mvitac.cli.options import STDOUT, save_json
 from mvitac.cli.pretrain import _chosen_run
 from mvitac.data.pack import Pack
 from mvitac.datasets import DatasetConfig, dataset
@@ -87,6 +88,12 @@ def test_advice_is_of_the_command_and_home_is_read(
         monkeypatch.setattr("mvitac.cli.main._run", run := Mock(side_effect=ValueError("name --data.order")))
         assert main([name, "--out=~/x"]) == 2 and capsys.readouterr().err == f"mvitac: error: name {advice}\n"
         assert run.call_args.args == ([name, "--out=/home/me/x"],)
+
+
+def test_a_full_stdout_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdout", Mock(write=Mock(side_effect=OSError(28, "No space left on device"))))
+    with pytest.raises(OSError, match="No space left on device: 'stdout'"):
+        save_json(STDOUT, {"a": 1})
 
 
 def test_a_path_is_data(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -69,6 +69,7 @@ def make_physiclear(root: Path) -> None:
     for k, thing in enumerate([*THINGS, "stranger"]):
         for video in (0, 1):
             film(root / f"dataset/{thing}_{video}.mov", 41, which=k + video)
+    (root / "dataset/stranger_1.mov").rename(root / "dataset/stranger_1.MOV")
 
     def ranks(shift: int, values: tuple[Any, ...]) -> dict[str, Any]:
         return {f"physiclear_{thing}": values[(k + shift) % len(values)] for k, thing in enumerate(THINGS)}
@@ -97,6 +98,8 @@ def make_vt60(root: Path) -> None:
             for k in range(5):
                 name = f"touch_{i}_img_{8 + k}_name_{category[3:]}_red_at_{42094 + k}_-{k}_25275.jpg"
                 picture(base / f"touch/{category}/0{i}" / name, 100 + 10 * k + i)
+    touch = next(base.glob("touch/03_ball/01/*_8_*"))
+    touch.rename(touch.with_suffix(".JPG"))
     for k in range(2):
         picture(base / f"vision/03_ball/07/IMG_inst_7_img_{k}_validframeID_1.jpg", k)  # photos only
 

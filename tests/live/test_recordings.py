@@ -187,6 +187,8 @@ def test_predict_command(
     own = _opened(FolderConfig(path=tmp_path / "free.csv", allow_leak=True), {"vision": (), "touch": ()}, minus)
     assert own.spec.difference and (own.images["touch"] == 128).all()
     (tmp_path / "gel.csv").write_text("touch\ntouch.png\n")
+    Image.fromarray(pack.images["touch"][8]).save(tmp_path / "other.png")
+    (tmp_path / "two.csv").write_text("vision,left,right\nvision.png,touch.png,other.png\n")
     (empty := tmp_path / "empty").mkdir()
     wrong = {
         (): "give one SOURCE",
@@ -196,6 +198,9 @@ def test_predict_command(
         ("--vision", "0", *both[2:]): "give a video",
         (str(empty),): "holds no pictures",
         (str(tmp_path / "some16"),): "some16 has images of vision of (16, 16, 3), the model takes (32, 32, 3)",
+        (
+            str(tmp_path / "two.csv"),
+        ): f"error: {tmp_path / 'two.csv'} has images of touch of (32, 32, 6), the model takes (",
         (str(tmp_path / "gel.csv"),): "has no vision, which the model takes too",
     }
     for words, says in wrong.items():

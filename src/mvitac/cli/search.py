@@ -28,7 +28,7 @@ class _EmbedOptions:
     """Embeddings of every row of a pack, with ids, groups, splits and labels; NaN where a row lacks the image."""
 
     pack: Positional[Path]
-    """Folder of the pack."""
+    """Folder of the pack, with images of the model's size."""
     model: str
     """Folder of a run or an artifact, or owner/name on the Hub."""
     out: Path

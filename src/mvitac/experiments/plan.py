@@ -72,7 +72,7 @@ class Plan:
         fixed |= {"recipe": "give --recipe, or recipe beside rows in the plan", "method": "a row of the plan names it"}
         fixed |= {"data.score_on": "rows are scored on the same samples, give --data.score-on"}
         given = {name for each in (self.set, *(row.set for row in self.rows)) for name, _ in dotted(each)}
-        for name in fixed.keys() & given:
+        for name in [name for name in fixed if name in given]:
             raise ValueError(f"{name}: {fixed[name]}")
         if not all(0 < len(slug(label).encode()) < 200 and "*" not in label for label in labels):  # a folder; a control
             raise ValueError(
