@@ -153,6 +153,11 @@ def test_scores_that_were_copied_from_another_run_are_computed_again(
     do_all(work := lay_out(small(pack), pack, out, ProbeConfig()), quiet=True)
     assert [record["group_correct"] for record in json.loads(two.read_text())["records"]] == right
     assert all(job.done for job in work.jobs)
+    for file in (two, two.with_name("failed.json"), out / "controls.json"):  # JSON of another kind
+        file.write_text("{}")
+        with pytest.raises(ValueError, match=f"{file.name} is damaged"):
+            gather(work, out, ProbeConfig())
+        file.unlink()
 
 
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.toml")), ids=lambda file: file.stem)

@@ -526,8 +526,8 @@ def test_what_was_recorded_is_kept_when_stdout_is_full(
 
     monkeypatch.setattr("sys.stdout", Mock(write=write, fileno=lambda: place))
     words = ["--always", "--calibration", "2", "--record", str(tmp_path / "r"), "--json", str(tmp_path / "s.json")]
-    assert main(["live", str(onnx), *words]) == 0 and Pack(tmp_path / "r").num > 0 and (tmp_path / "s.json").is_file()
-    assert "stopped: stdout: No space left on device" in capsys.readouterr().err
+    assert main(["live", str(onnx), *words]) == 2 and Pack(tmp_path / "r").num > 0 and (tmp_path / "s.json").is_file()
+    assert "stdout: No space left on device" in capsys.readouterr().err
 
 
 def test_sigterm_ends_it_as_ctrl_c_does(

@@ -113,7 +113,7 @@ def live(argv: list[str]) -> None:
         cuts = ((m, [s.origin.crop for s in several if s.origin.crop]) for m, several in streams.items())
         crop = {m: ", ".join(":".join(map(str, cut)) for cut in parts) for m, parts in cuts if parts}
         loop.record = recorder = Recorder(options.record, sensor=sensor, crop=crop, tell=_say)
-    _run(loop, options.seconds)
+    failed = _run(loop, options.seconds)
     if loop.counts["calibrated"] < sum(contact.free is None for contact in loop.contacts.values()):
         _say(f"contact was never known: no {options.live.calibration} frames without it, and no --background")
     _say(f"summary: {json.dumps(loop.summary())}")
@@ -124,14 +124,16 @@ def live(argv: list[str]) -> None:
             write_json(options.json, loop.summary())
     if recorder:
         _say(f"recorded: {options.record}, {num} pairs" if num else "nothing was recorded")
+    if failed:
+        raise failed
 
 
-def _run(loop: Live, seconds: float | None) -> None:
+def _run(loop: Live, seconds: float | None) -> OSError | None:
     """Print every prediction and release until all streams ended, ``seconds`` are over, Ctrl-C or SIGTERM.
 
-    Every stream is read in a thread of its own.
+    Every stream is read in a thread of its own. Return why stdout took no more, if so.
     """
-    start, news = loop.clock(), threading.Event()
+    start, news, failed = loop.clock(), threading.Event(), None
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: what was recorded becomes a pack
     threads = [CaptureThread(stream, news.set) for stream in loop.all]
     for thread in threads:
@@ -147,7 +149,7 @@ def _run(loop: Live, seconds: float | None) -> None:
                     print(json.dumps(short), flush=True)
                 except OSError as error:  # whoever read it has enough, or its disk is full: what was recorded is kept
                     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-                    _say(f"stopped: stdout: {error.strerror}")
+                    failed = OSError(error.errno, f"stdout: {error.strerror}")
                     break
     except KeyboardInterrupt:
         _say("stopped")
@@ -158,6 +160,7 @@ def _run(loop: Live, seconds: float | None) -> None:
             thread.join(2.0)  # a device that hangs must not hang us
         signal.signal(signal.SIGTERM, before)
     loop.finish()
+    return failed
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -51,7 +51,8 @@ def parse(
     except SystemExit as exit_:
         if not exit_.code:  # what has no default, or may be left out, need not be said
             text = re.sub(r"\{None\}\|(\S+ )( +\S)", r"\1       \2", shown.getvalue())
-            text = re.sub(r"\{None\}\||\s+\(default:\s+(None)?\)", "", text)
+            text = re.sub(r"\{None\}\||\s+\(default:\s+(None|False)?\)", "", text)
+            text = re.sub(r"\(default:\s+True\)", "(default: on)", text)  # a flag's text is that of its other form
             for line in text.split("\n")[:-1]:  # but for a list of choices, which ``_check_choices`` reads
                 print(line if line[:1] == " " else textwrap.fill(line, 80))
             raise

@@ -164,7 +164,6 @@ def tables(suite: Suite, values: Sequence[dict[str, Any]]) -> dict[str, tuple[li
 
 
 def _cell(suite: Suite, known: Scored, source: str, key: tuple[str, str]) -> str:
-    """Errors and interval, and * where the row differs from the untrained trunk."""
     if not (cells := known[source].get(key)):
         return ""
     beside = known.get(f"untrained, with {source.rpartition(', with ')[2]}", known["untrained"])  # of the same result

@@ -179,7 +179,6 @@ class Copy:
     """One physical sensor, drawn: a known one, or a copy of the ``new`` one that no probe learned on."""
 
     def __init__(self, rng: np.random.Generator, *, new: bool, noise: float = 1.0) -> None:
-        """``noise`` multiplies that of its camera."""
         choice = [s for s in SENSORS.values() if s.held_out == new]
         sensor = choice[int(rng.random() * len(choice))]
         self.gain = float(np.exp(rng.uniform(*np.log((0.5, 1.2)))))
@@ -215,7 +214,6 @@ def presses(name: str, seed: int, each: int, number: int) -> tuple[np.ndarray, n
 
 
 def _near(task: Any, shape: Shape, asked: np.ndarray, along: float) -> np.ndarray:
-    """The state that has the pose ``asked`` near ``along`` on the path."""
     state = task.state(shape, task.target, 0.0)
     for _ in range(max(0, round(along / STEP_MM))):
         state = task.moved(shape, state, task.target - task.pose(shape, state))

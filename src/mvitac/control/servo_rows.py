@@ -124,7 +124,6 @@ class Episode:
         self._go(first)
 
     def _go(self, state: np.ndarray) -> None:
-        """Be there. What is seen and known is of some steps before."""
         self.states.append(state)
         self.poses.append(self.task.pose(self.shape, state))
         self.lost |= bool((np.abs(self.poses[-1] - self.task.target) > self.task.limit).any())

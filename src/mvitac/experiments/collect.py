@@ -27,7 +27,7 @@ from mvitac.nn.encoders import SCRATCH
 from mvitac.registry import to_json
 from mvitac.run import Run, load_run, precision_of
 from mvitac.system.device import Hardware, describe, pick_device
-from mvitac.system.files import digest, read_json, write_json
+from mvitac.system.files import digest, fields_of, read_json, write_json
 from mvitac.system.provenance import provenance
 from mvitac.training.setup import check_same
 
@@ -136,9 +136,10 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
 
 
 def _scores(job: Job) -> tuple[Records, Records]:
-    scores = read_json(job.out / "scores.json", "a run's scores")
-    named = [{**r, "source": job.label + r["source"].removeprefix(job.run.method.name)} for r in scores["records"]]
-    return named, [{**found, "source": job.label} for found in scores["retrieval"]]
+    with fields_of(path := job.out / "scores.json"):
+        scores = read_json(path, "a run's scores")
+        named = [{**r, "source": job.label + r["source"].removeprefix(job.run.method.name)} for r in scores["records"]]
+        return named, [{**found, "source": job.label} for found in scores["retrieval"]]
 
 
 def _controls(work: Work, out: Path, session: ProbeConfig) -> tuple[Records, Records]:
@@ -147,9 +148,9 @@ def _controls(work: Work, out: Path, session: ProbeConfig) -> tuple[Records, Rec
     runs = [job.run for job in work.jobs if job.label == work.plan.reference] or [work.jobs[0].run]
     frozen = [name for name, _ in frozen_trunks(runs)]  # weights may be installed later
     key = digest([to_json(session), work.pack.digest, to_json(work.pack.spec), [run.digest() for run in runs], frozen])
-    path = out / "controls.json"
-    if path.exists() and (kept := read_json(path, "the controls"))["key"] == key:
-        return kept["records"], kept["retrieval"]
+    with fields_of(path := out / "controls.json"):
+        if path.exists() and (kept := read_json(path, "the controls"))["key"] == key:
+            return kept["records"], kept["retrieval"]
     tasks, modalities = chosen(work.pack, session)
     records, retrieval = controls_of(runs, work.pack, tasks, modalities, session.probes)
     write_json(path, {"key": key, "records": records, "retrieval": retrieval}, sealed=True)

@@ -13,7 +13,7 @@ from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.experiments.plan import Plan
 from mvitac.registry import to_json
 from mvitac.run import Run
-from mvitac.system.files import brief, read_json, write_json
+from mvitac.system.files import brief, fields_of, read_json, write_json
 from mvitac.system.locks import Busy, hold_lock
 from mvitac.training.checkpoint import CHECKPOINT, PREVIOUS
 from mvitac.training.log import read_log, seconds_of
@@ -45,15 +45,17 @@ class Job:
     def failure(self) -> str:
         """Why the run diverged; "" if it did not."""
         path = self.out / "failed.json"
-        return read_json(path, "a failure")["error"] if path.exists() else ""
+        with fields_of(path):
+            return str(read_json(path, "a failure")["error"]) if path.exists() else ""
 
     @property
     def done(self) -> bool:
         path = self.out / "scores.json"
         if self.failure or not path.exists():
             return bool(self.failure)
-        found = read_json(path, "a run's scores")  # which may have been copied from another run
-        return (found["asked"], found.get("of")) == (self.asked, self.run.digest())
+        with fields_of(path):
+            found = read_json(path, "a run's scores")  # which may have been copied from another run
+            return (found["asked"], found["of"]) == (self.asked, self.run.digest())
 
     def seconds(self) -> float:
         return seconds_of(read_log(self.out), self.run.batch_size)

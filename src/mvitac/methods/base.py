@@ -57,7 +57,6 @@ class Method(nn.Module, ABC):
     """Views per image that ``forward`` needs."""
 
     def __init_subclass__(cls, config: "type[MethodConfig] | None" = None) -> None:
-        """``config``: that by which the method is chosen, which builds it."""
         if config:
             config.method = cls
 

@@ -61,7 +61,6 @@ def mvitac_tiny_vit(pretrained: bool = False, **kwargs: Any) -> VisionTransforme
 
 
 def _from_scratch(name: str, pretrained: bool, kwargs: dict[str, Any]) -> None:
-    """Refuse pretrained weights, and drop what timm says of them from ``kwargs``."""
     if pretrained:
         raise ValueError(f"{name} has no ImageNet weights: use --encoder.weights scratch")
     for key in ("pretrained_cfg", "pretrained_cfg_overlay", "cache_dir"):

@@ -90,7 +90,6 @@ def use_convolutions(trunk: nn.Module) -> nn.Module:
 
 
 def _ours(conv: nn.Conv2d) -> type[nn.Module]:
-    """The class that computes what ``conv`` does; its own if none of ours does."""
     kind, side, same = type(conv), conv.kernel_size[0], type(conv) is Conv2dSame
     padding = (0, 0) if same else (side // 2, side // 2)
     shape = ((side, side), padding, (1, 1), "zeros", None, (conv.stride[0],) * 2)

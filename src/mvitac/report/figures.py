@@ -126,7 +126,7 @@ def curves(title: str, lines: Sequence[Line], references: Mapping[str, float] | 
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.ticklabel_format(axis="y", useOffset=False)
     axes.margins(y=0.12)
-    axes.set(xlim=(0, 1.04 * max(max(line.x) for line in lines)), xlabel="step")
+    axes.set(xlim=(0, 1.04 * max(1, *(max(line.x) for line in lines))), xlabel="step")
     labels = [shorten(label, 30) for label in handles]
     figure.legend(list(handles.values()), labels, loc=BELOW, ncols=2 if max(map(len, labels)) > 18 else 3)
     return figure
