@@ -26,8 +26,7 @@ def written(kind: str, folder: Path) -> Path:
     rgb = rng.integers(0, 256, (20, 24, 3), dtype=np.uint8)
     path = folder / "touch.png"
     if kind == "jpeg rotated by EXIF":
-        path = folder / "touch.jpg"
-        exif = Image.Exif()
+        path, exif = folder / "touch.jpg", Image.Exif()
         exif[ExifTags.Base.Orientation] = 6
         Image.fromarray(rgb).save(path, quality=95, exif=exif)
     elif kind == "RGBA":
@@ -122,8 +121,7 @@ def test_a_damaged_jpeg_is_refused(tmp_path: Path, progressive: bool) -> None:
 def test_bytes_after_a_jpeg_and_padding_of_usb_cameras_are_allowed(tmp_path: Path) -> None:
     path, end = tmp_path / "touch.jpg", b"\xff\xd9"
     smooth((64, 48)).save(path)
-    whole = path.read_bytes()
-    pixels = np.asarray(decode(path))
+    whole, pixels = path.read_bytes(), np.asarray(decode(path))
     for allowed in (whole + b"trailer", whole[:-2] + bytes(2) + end):
         path.write_bytes(allowed)
         assert np.array_equal(np.asarray(decode(path)), pixels)
