@@ -84,8 +84,6 @@ def by_the_probe(model: Model, both: Pack, rows: np.ndarray) -> dict[str, np.nda
 class Played(Source):
     """Frames given beforehand."""
 
-    paced = False
-
     def __init__(self, frames: list[np.ndarray]) -> None:
         self.left = deque(frames)
 

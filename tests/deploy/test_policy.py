@@ -52,6 +52,7 @@ def test_only_tuned_encoders_get_gradients_and_their_batchnorm_stays(model: Mode
     assert all(p.grad is not None for p in policy[1].parameters())
     assert encoder.maps(observe(pack, [0]))["vision"].requires_grad == tune
     assert all(torch.equal(before[k], v) for k, v in encoder.named_buffers())
+    assert {p.requires_grad and p.grad is None for p in model.encoders.parameters()} == {True}  # they are copied
 
 
 def test_what_does_not_fit_is_named(model: Model, pack: Pack) -> None:
@@ -65,6 +66,8 @@ def test_what_does_not_fit_is_named(model: Model, pack: Pack) -> None:
         for wrong in (not_divided, normalised_already, nan, last):
             with pytest.raises(ValueError, match=r"expected .*float"):
                 encoder(wrong)
+        with pytest.raises(ValueError, match=r"wrist: \[3, \d+, \d+\] has no axis for the batch"):
+            encoder({k: v[0] for k, v in seen.items()})
         with pytest.raises(ValueError, match=r"gel: .* does not fit images of \[1, 3, "):
             encoder({**seen, "observation.images.gel": seen["observation.images.gel"].repeat(2, 1, 1, 1)})
         encoder(seen)

@@ -20,7 +20,9 @@ from mvitac.datasets.folder import FolderConfig
 from mvitac.deploy.engine import Engine
 from mvitac.live.cameras import Recording, recording
 from mvitac.live.contact import LiveConfig
+from mvitac.live.predictor import Live
 from mvitac.live.recordings import Recordings, answers, pack_tables
+from mvitac.live.streams import CaptureThread, Stream
 from support.videos import write_video
 
 NUM, FREE = 50, 20
@@ -91,10 +93,31 @@ def test_pictures_named_by_their_time_are_at_it(tmp_path: Path) -> None:
     for time in (1_700_000_000.25, 1_700_000_000.5, 1_700_000_020):
         Image.new("RGB", (8, 8)).save(tmp_path / f"{time}.png")
     stamped = recording(str(tmp_path))
-    assert (stamped.times - 1_700_000_000).tolist() == [0.25, 0.5, 20] and stamped.fps == pytest.approx(2 / 19.75)
+    assert (stamped.times - 1_700_000_000).tolist() == [0.25, 0.5, 20]
     assert recording(f"{tmp_path}@5").times.tolist() == [0, 0.2, 0.4]
     (tmp_path / "1.png").write_bytes(b"")
     assert recording(str(tmp_path)).times[1] == 1 / 30
+
+
+def test_recordings_are_played_at_their_times(engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The camera begins two seconds after the gel, whose frames have a gap."""
+    for name, times in {"vision": (2, 2.5), "touch": (0, 0.5, 5), "late": (6, 7)}.items():
+        (tmp_path / name).mkdir()
+        for time in times:
+            Image.new("RGB", (8, 8)).save(tmp_path / name / f"{1_700_000_000 + time}.png")
+    played: dict[str, list[float]] = {}
+    streams: Any = {m: [Stream(m, recording(str(tmp_path / m)))] for m in engine.inputs}
+    Live(engine, streams)
+    for m, (stream,) in streams.items():
+        clock, played[m] = SimpleNamespace(now=40.0), []
+        thread = CaptureThread(stream, lambda m=m, clock=clock: played[m].append(clock.now - 40))
+        monkeypatch.setattr("mvitac.live.streams.time", SimpleNamespace(monotonic=lambda clock=clock: clock.now))
+        thread.stopping = SimpleNamespace(wait=lambda wait, clock=clock: setattr(clock, "now", clock.now + wait))  # type: ignore[assignment]
+        thread.run()
+    assert played == {"vision": pytest.approx([2, 2.5, 2.6]), "touch": pytest.approx([0, 0.5, 5, 5.1])}  # .1: it ends
+    streams["vision"] = [Stream("vision", recording(str(tmp_path / "late")))]
+    with pytest.raises(ValueError, match=r"touch ends at 1700000005.00 s, .*late begins at 1700000006.00 s"):
+        Live(engine, streams)
 
 
 def test_names_of_ours_and_of_others_are_not_taken(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@
 Follows LeRobot's convention: images are [B, 3, H, W] (or [B, T, 3, H, W]), float in [0, 1] or uint8, RGB.
 """
 
+import copy
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -44,7 +45,8 @@ class ObservationEncoder(nn.Module):
             wanted = model.spec.channels(modality) // 3
             if len(names) != wanted:
                 raise ValueError(f"the {modality} encoder takes {wanted} image(s), given: {', '.join(names)}")
-        self.encoders = nn.ModuleDict({m: model.encoders[m] for m in self.keys})
+        # Copies: a policy that tunes its encoders changes neither ``model`` nor another policy.
+        self.encoders = nn.ModuleDict({m: copy.deepcopy(model.encoders[m]) for m in self.keys})
         self.stored, self.state, self.tune, self._input = model.stored, state, tune, model.input
         self._checked: set[str] = set()
         self.encoders.requires_grad_(tune)
@@ -81,8 +83,11 @@ class ObservationEncoder(nn.Module):
             views = []
             for name in names:
                 image = observation[name]
-                if image.shape[:-3] != lead:
-                    raise ValueError(f"{name}: {list(image.shape)} does not fit images of {list(first.shape)}")
+                if image.ndim < 4 or image.shape[:-3] != lead:
+                    how = (
+                        f"does not fit images of {list(first.shape)}" if first.ndim > 3 else "has no axis for the batch"
+                    )
+                    raise ValueError(f"{name}: {list(image.shape)} {how}")
                 check = image.is_cpu or name not in self._checked  # on a GPU, the values of the first only
                 images = check_images(image.flatten(0, -4), 3, name, values=check)
                 self._checked.add(name)

@@ -7,6 +7,7 @@ import glob
 import importlib.util
 import re
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,8 @@ from mvitac.data.video import VIDEOS, frames
 from mvitac.sim.sensors import SENSORS
 from mvitac.system.files import brief
 
+TOGETHER = 0.5  # seconds by which frames of several recordings may be apart
+
 
 class Ended(Exception):
     """A source has no more frames."""
@@ -25,8 +28,6 @@ class Ended(Exception):
 class Source(ABC):
     """A source of frames. ``read`` raises OSError if the device is gone, ValueError for one damaged frame."""
 
-    fps: float = 30.0  # nominal rate
-    paced: bool = True  # whether ``read`` itself waits for the next frame
     captured: float | None = None  # when the newest frame was, by the stream's clock; None: when it was read
     crop: tuple[int, ...] = ()  # left, top, width and height of the part that is used
     sensor: str = ""  # name of the touch sensor, as in column sensor of packs; "" = not known
@@ -36,6 +37,10 @@ class Source(ABC):
 
     @abstractmethod
     def read(self) -> np.ndarray: ...
+
+    def wait(self, elapsed: float) -> float:
+        """Seconds until the next ``read``, ``elapsed`` after the start; 0 for a device that waits itself."""
+        return 0.0
 
     def close(self) -> None:  # noqa: B027 - most have nothing to close
         pass
@@ -81,7 +86,6 @@ class Camera(Source):
         if any(v and has and abs(has - v) > 0.05 * v for has, v in zip(given, asked.values(), strict=True)):
             mode = f"{given[0]:g}x{given[1]:g} at {given[2]:g} fps"
             raise OSError(f"camera {self.which} has no such mode: it gives {mode}")
-        self.fps = given[2] or 30.0
 
     def read(self) -> np.ndarray:
         good, image = self.capture.read()
@@ -97,8 +101,9 @@ class Camera(Source):
 class Recording(Source):
     """A recording: a source that ends, and knows the time of each of its frames."""
 
-    paced = False
+    path: Path
     times: np.ndarray  # [N] seconds, from ``open``
+    begin: float | None = None  # the time at which it starts (``start_together``); None: that of its first frame
     number = -1  # of the frame that was read last, or was damaged
 
     @property
@@ -106,9 +111,9 @@ class Recording(Source):
         """Time of the frame that was read last."""
         return float(self.times[max(0, self.number)])
 
-    def _timed(self, times: np.ndarray) -> None:
-        self.times, seconds = times, float(np.ptp(times))
-        self.fps = (len(times) - 1) / seconds if seconds else 30.0
+    def wait(self, elapsed: float) -> float:
+        after = [*self.times[self.number + 1 :][:1], self.time + 0.1][0]  # 0.1: the last frame is used before the end
+        return float(after - (self.times[0] if self.begin is None else self.begin)) - elapsed
 
     def read(self) -> np.ndarray:
         if self.number + 1 >= len(self.times):
@@ -121,6 +126,16 @@ class Recording(Source):
         """Frame ``number``; they are asked for in order."""
 
 
+def start_together(files: Sequence[Recording]) -> None:
+    """Let ``files`` start at one time, by their stamps; ValueError if two of them share none."""
+    late, early = max(files, key=lambda file: file.times[0]), min(files, key=lambda file: file.times[-1])
+    if late.times[0] > early.times[-1] + TOGETHER:
+        ends = f"{early.path} ends at {early.times[-1]:.2f} s, {late.path} begins at {late.times[0]:.2f} s"
+        raise ValueError(f"{ends}: give recordings of the same time, or FOLDER@FPS to pass over names that are times")
+    for file in files:
+        file.begin = float(min(file.times[0] for file in files))
+
+
 class Video(Recording):
     """A video file, at its own frame rate."""
 
@@ -131,7 +146,7 @@ class Video(Recording):
         if self.number < 0:
             from mvitac.datasets.table.clocks import times_of  # robots that read no video have no pyarrow
 
-            self._timed(times_of(self.path))
+            self.times = times_of(self.path)
         self.number, self.lost = -1, {}
         self.left = frames(self.path, range(len(self.times)), lost=self.lost)
         self.next = next(self.left, None)
@@ -156,7 +171,7 @@ class Folder(Recording):
         if not self.files:
             raise OSError(f"{self.path} holds no pictures ({', '.join(IMAGES)})")
         times = None if self.rate else stamped([file.stem for file in self.files])
-        self._timed(np.arange(len(self.files)) / (self.rate or 30.0) if times is None else times)
+        self.times = np.arange(len(self.files)) / (self.rate or 30.0) if times is None else times
         self.number = -1
 
     def image(self, number: int) -> np.ndarray:
@@ -170,7 +185,6 @@ class Simulated(Source):
     slow machine for more than a second.
     """
 
-    paced = False
     first, rest, hold = 3.0, 1.0, 2.0
 
     def __init__(self, modality: str, seed: int = 0, fps: float = 30.0, size: int = 72) -> None:
@@ -180,6 +194,9 @@ class Simulated(Source):
     def open(self) -> None:
         self.number, self.touch = 0, -1
         self.noise = np.random.default_rng([self.seed, self.modality == "touch"])
+
+    def wait(self, elapsed: float) -> float:
+        return 1 / self.fps
 
     def read(self) -> np.ndarray:
         from mvitac.sim import gel, materials

@@ -16,6 +16,7 @@ import numpy as np
 
 from mvitac.data.images import difference, fit
 from mvitac.deploy.engine import Engine, frame_shapes, frames_of, spread_at
+from mvitac.live.cameras import Recording, start_together
 from mvitac.live.contact import Contact, LiveConfig
 from mvitac.live.streams import Event, Frame, Stream
 
@@ -79,7 +80,8 @@ class Live:
             always: predict from every frame; without contact, an answer is that of its frame alone.
 
         Raises:
-            ValueError: the engine takes other inputs, or other backgrounds subtracted than those that can be learned live.
+            ValueError: the engine takes other inputs, or other backgrounds subtracted than those that can be learned live;
+                recordings are not of the same time.
         """
         given = {m: len(several) for m, several in streams.items()}
         if given != (wanted := {m: shape[2] // 3 for m, shape in frame_shapes(engine).items()}):
@@ -89,6 +91,8 @@ class Live:
         self.all = [s for several in streams.values() for s in several]
         self._leads = "touch" if "touch" in streams else "vision"
         self.leading = streams[self._leads][0]  # the stream whose new frames start predictions
+        if files := [stream.origin for stream in self.all if isinstance(stream.origin, Recording)]:
+            start_together(files)
         window = engine.window or {"minus_first": False}
         if window["minus_first"] and (engine.difference or "vision" in window["of"]):
             raise ValueError("live learns the background of touch alone: not that of vision, nor frames minus it twice")

@@ -14,7 +14,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import Window
 from mvitac.data.windows import windowed
 from mvitac.deploy.engine import Engine, frame_shapes, spread_at
-from mvitac.live.cameras import Recording
+from mvitac.live.cameras import TOGETHER, Recording
 from mvitac.live.contact import LiveConfig
 from mvitac.live.predictor import Live, own_name
 from mvitac.live.streams import Event, Stream
@@ -23,7 +23,6 @@ from mvitac.system.files import brief
 from mvitac.system.prefetch import prefetch
 
 BATCH = 32
-TOGETHER = 0.5  # seconds by which frames of several recordings may be apart
 Table = dict[str, Any]
 
 

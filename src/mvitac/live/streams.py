@@ -168,21 +168,18 @@ class Stream:
 
 
 class CaptureThread(threading.Thread):
-    """Reads one stream until ``stopping`` is set; files are read at their own frame rate."""
+    """Reads one stream until ``stopping`` is set; the frames of files at their times."""
 
     def __init__(self, stream: Stream, wake: Callable[[], None]) -> None:
         super().__init__(name=f"capture {stream.name}", daemon=True)
         self.stream, self.wake, self.stopping = stream, wake, threading.Event()
 
     def run(self) -> None:
-        due = time.monotonic()
-        while not self.stopping.is_set() and not self.stream.ended:
+        start, origin = time.monotonic(), self.stream.origin
+        while not self.stream.ended:
+            wait = origin.wait(time.monotonic() - start)
+            if self.stopping.wait(max(wait, 0.1 if self.stream.fault == "unplugged" else 0.0)):
+                break
             self.stream.pump()
             self.wake()
-            wait = 0.1 if self.stream.fault == "unplugged" else 0.0
-            if not self.stream.origin.paced:
-                due = max(due + 1 / self.stream.origin.fps, time.monotonic() - 0.1)
-                wait = due - time.monotonic()
-            if wait > 0:
-                self.stopping.wait(wait)
         self.stream.close()
