@@ -608,6 +608,11 @@ def test_another_encoder_does_not_replace_a_result(results: list[Path], root: Pa
     changed(results[0], root / results[0].name, put("blocks", 0, "data", "rows", value="0" * 64), signed=True)
     with pytest.raises(ValueError, match="is the result on other data of stripes: move it"):
         run_bench([str(smoke_run)], toys, root, root, About())
+    changed(results[0], root / results[0].name, put("blocks", 0, "task", value="left"), signed=True)
+    with pytest.raises(ValueError, match="is the result on stripes: left, which is not run now: move it"):
+        run_bench([str(smoke_run)], toys, root, root, About())
+    with pytest.raises(ValueError, match="is the result of another suite 'toys'"):
+        run_bench([str(smoke_run)], replace(toys, seed=toys.seed + 1), results[0].parent, root, About())
     with pytest.raises(ValueError, match="not seeds of one encoder"):
         run_bench([RANDOM.format(6), RANDOM.format(6)], toys, results[0].parent, root, About())
     torch.save(timm.create_model("test_resnet").state_dict(), root / "w.pth")

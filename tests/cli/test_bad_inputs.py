@@ -143,6 +143,8 @@ WORDS: list[tuple[str, str, str]] = [
     ("bench {run} ", "--suite servo-v1 --data-root {tmp}", "--data-root has no effect on servo-v1"),
     ("bench {run} ", "--suite sim-v3 --data-root {tmp}", "--data-root has no effect on sim-v3"),
     ("bench {run} --suite sim-v3 ", "--licence MIT\x1b", "--licence: 'MIT\\x1b' has a control character"),
+    ("data info ", "{tmp}/x\x1b[2J", "no pack at {tmp}/x\\x1b[2J"),
+    (SIMULATE, "--data.labels feel", "Unrecognized options: --data.labels"),
     ("live e ", "--touch=", "--vision or --touch is empty: name a SOURCE"),
     ("predict {run} ", "--background {tmp}/a.png --calibration 9 --touch sim --out {out}", "give a video (.mp4"),
     ("compare ", "--data pack --data.path {pack} --dry-run --tables-only --out {out}", "no effect beside --dry-run"),

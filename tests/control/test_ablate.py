@@ -12,7 +12,16 @@ import pytest
 from PIL import Image
 
 from mvitac.cli.main import main
-from mvitac.control.ablate import Recorded, ablate, act, open_policy, read_episodes, suite_episodes, suite_policy
+from mvitac.control.ablate import (
+    Episodes,
+    Recorded,
+    ablate,
+    act,
+    open_policy,
+    read_episodes,
+    suite_episodes,
+    suite_policy,
+)
 from mvitac.control.result import find_suite
 from mvitac.control.video import film, webp
 from mvitac.data.build import build
@@ -128,6 +137,35 @@ def test_a_policy_may_change_its_images_in_place() -> None:
 
     clean = ablate(lambda o: [(255 - o["touch"]).mean() / 100, 0.0], replace(episodes))
     assert ablate(inverted, episodes)["rows"] == clean["rows"]
+
+
+class Way:
+    """Four millimetres at the pace that the gel shows; the loss is the number of steps."""
+
+    senses, most, values = ("touch",), (4.0,), {}  # type: ignore[var-annotated]
+
+    def __init__(self, pace: int) -> None:
+        self.pace, self.mm, self.loss = pace, 0.0, 0.0
+
+    @property
+    def over(self) -> bool:
+        return self.mm >= 4
+
+    def look(self, sense: str) -> np.ndarray:
+        return np.full((2, 2, 3), self.pace, np.uint8)
+
+    def step(self, action: np.ndarray) -> None:
+        self.mm, self.loss = self.mm + max(1.0, action[0]), self.loss + 1
+
+
+def test_episodes_may_end_when_the_policy_is_done() -> None:
+    """Two and four steps in turn, or with the gel of the next episode four and two: changes of +2 and -2."""
+    paces = [1, 2, 1, 2, 1, 2]
+    episodes = Episodes(begin=[partial(Way, pace) for pace in paces], senses=("touch",), unit="steps")
+    found = ablate(lambda o: [o["touch"].mean()], episodes)
+    rows = {row["kind"]: row for row in found["rows"]}
+    assert found["error"][0] == 3 and rows["another episode"]["error"][0] == 0 == rows["10 frames ago"]["error"][0]
+    assert rows["mean frame"]["error"][0] == 1  # four steps in each episode
 
 
 def test_numbers_that_would_be_wrong(pack: Pack) -> None:

@@ -240,7 +240,7 @@ def test_parts_are_made_again_from_the_first_whose_files_have_changed(pack: Pack
     assert contents(tmp_path / "p") == contents(pack.path), "no pack tells when its files were written"
 
 
-def test_damaged_items_stop_or_are_listed(tmp_path: Path) -> None:
+def test_damaged_items_stop_or_are_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = Toy(damaged=(3, 40))
     with pytest.raises(ValueError, match=r"2 of 120 items cannot be read, first item 3: item 3 is damaged.*repair it"):
         build(source, tmp_path / "strict", size=32, quiet=True)

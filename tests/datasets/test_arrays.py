@@ -471,6 +471,8 @@ def shaped(shape: tuple[int, ...], kind: str) -> bytes:
 
 NPY: dict[str, tuple[bytes, str]] = {
     "no end of pixels": (shaped((10**6, 10**6), "|u1"), "cannot be read as an array"),
+    "a side below 0": (shaped((-4, 40, 3), "|u1"), "cannot be read as an array"),
+    "no whole side": (shaped((True, 40), "|u1"), "cannot be read as an array"),
     "nothing": (shaped((0, 0, 3), "|u1"), "has 0 pixels"),
     "text": (shaped((1, 1), "<U1") + b"a\0\0\0", r"is <U1 \[1, 1\]: give numbers"),
     "complex": (shaped((1, 1), "<c8") + bytes(8), r"is complex64 \[1, 1\]: give numbers"),

@@ -169,6 +169,11 @@ def own_times(name: str, *lines: object) -> Callable[[Path], None]:
         (spoil(36, stamp=lambda _: "then"), r"force\.csv, column stamp: 'then' is no time: give seconds"),
         (own_times("txt", *range(30), 20, *range(31, 50)), r"gel_timestamps\.txt: time 31 is before the one above it"),
         (own_times("txt", *range(49), float("nan")), r"gel_timestamps\.txt: 'nan' is no time"),
+        (
+            lambda root: (root / "0/gel_timestamps.txt").symlink_to("none"),
+            r"No such file or directory: .*gel_timestamps\.txt",
+        ),
+        (lambda root: os.mkfifo(root / "0/gel_timestamps.txt"), r"gel_timestamps\.txt is neither a file nor a folder"),
         (own_times("csv", "time", *[1.5] * 50), r"gel_timestamps\.csv: all 50 times are 1\.5 s: a clock that stands"),
         (spoil(stamp=lambda _: "0.3"), r"force\.csv, column stamp: all \d+ times are 0\.3 s: a clock that stands"),
         (own_times("txt", *range(49)), r"gel_timestamps\.txt has 49 times, gel\.mp4 has 50 frames"),
@@ -180,7 +185,7 @@ def own_times(name: str, *lines: object) -> Callable[[Path], None]:
 )
 def test_logs_that_would_give_wrong_numbers(tmp_path: Path, change: Callable[[Path], None], says: str) -> None:
     change(recorded(tmp_path / "set", num=2))
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises((ValueError, OSError), match=says):
         packed(tmp_path / "set", tmp_path / "p", **LOG)
 
 

@@ -444,6 +444,9 @@ def test_a_leak_of_a_tasks_own_split_is_flagged(pack: Pack) -> None:
     said = own.split_leaks([pattern, task])
     assert said == {"split_bright": "30 of 30 test instances of bright are also in train: this split leaks"}
     assert own.split_leaks([pattern]) == {}  # nothing that is scored
+    for side in ("train", "test"):  # without labels there
+        labels = np.where(own.column("split_bright") == side, -1, own.labels("bright"))
+        assert with_columns(own, label_bright=labels).split_leaks([pattern, task]) == {}
 
 
 def test_names_and_units_are_text_in_latex_and_markdown() -> None:

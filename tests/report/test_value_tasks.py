@@ -74,6 +74,9 @@ def test_a_probe_that_values_lack_does_not_hide_them(scored: tuple[Path, Pack, d
     assert by_paper["light"] == ridge["light"] != near["light"]
     assert by_paper["pattern"]["touch"]["mvitac"] != ridge["pattern"]["touch"]["mvitac"]
     assert set(summarise_again([r for r in result["records"] if r["probe"] != "knn"], "paper")) == {"pattern", "bright"}
+    own = [{**r, "probe": "own"} for r in result["records"] if (r["source"], r["probe"]) == ("mvitac", "knn")]
+    again = summarise_again([*result["records"], *own], "own")  # no control has that head
+    assert {source for task in again.values() for cells in task.values() for source in cells} == {"mvitac"}
 
 
 def test_targets_have_scores_of_their_own(scored: tuple[Path, Pack, dict[str, Any]]) -> None:

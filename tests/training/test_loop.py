@@ -17,7 +17,7 @@ from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.evaluation.probe import probe_model
-from mvitac.methods.mvitac import MViTacConfig
+from mvitac.methods.mvitac import MViTac, MViTacConfig
 from mvitac.model import fresh, load
 from mvitac.recipes import recipe
 from mvitac.run import Optim, Run
@@ -170,7 +170,9 @@ def test_ctrl_c_saves_and_is_told(step: int, says: str, pack: Pack, smoke_run: P
     assert_equal_weights(smoke_run, tmp_path / "r")
 
 
-def test_not_a_number_stops_and_keeps_the_last_good_checkpoint(pack: Pack, tmp_path: Path) -> None:
+def test_not_a_number_stops_and_keeps_the_last_good_checkpoint(
+    pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Where losses are reported, with step, parts and advice, and before each checkpoint is written."""
     run = smoke(pack, optim=Optim(name="sgd", lr=1e30), log_every=1)
     with pytest.raises(Diverged, match=r"not finite at step \d \(.*vv .*\).*lower --optim\.lr"):
@@ -180,6 +182,10 @@ def test_not_a_number_stops_and_keeps_the_last_good_checkpoint(pack: Pack, tmp_p
     kept = torch.load(tmp_path / "r" / "checkpoint.pt", weights_only=True)
     assert 1 <= kept["step"] < 8 and all(torch.isfinite(value).all() for value in kept["method"].values())
     assert not list(tmp_path.glob("*/model.safetensors"))
+    for losses in ({"other": torch.zeros(())}, {"loss": torch.zeros(2)}, torch.zeros(())):
+        monkeypatch.setattr(MViTac, "contrast", lambda self, z, losses=losses: losses)
+        with pytest.raises(ValueError, match="MViTac returned no dict with a scalar tensor 'loss'"):
+            train(run, tmp_path / "no", quiet=True, resume=True)
 
 
 def test_a_run_is_not_trained_over(pack: Pack, smoke_run: Path) -> None:

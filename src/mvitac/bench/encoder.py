@@ -77,15 +77,21 @@ def measure(
     old: dict[str, Any] = read_signed(path, form) if path.exists() else {"encoder": encoder}
     if (of := old["encoder"]["weights"]) != encoder["weights"]:
         raise ValueError(f"{path} is the result of other weights ({of[0][:12]}): give --name, or another --out")
+    if old.get("suite_digest", suite.digest()) != suite.digest():
+        raise ValueError(
+            f"{path} is the result of another suite {suite.name!r}: rename the suite, or give another --out"
+        )
     start = time.perf_counter()
     with hold_lock(path, f"another process writes {path}: wait for it, or give another --out", wait=False):
         found = score(models, encoder)
-        was = {(b["set"], b["task"]): b["data"] for b in old.get("blocks", ()) if "data" in b}
-        for b in found.get("blocks", ()):
-            if "data" in b and was.get((b["set"], b["task"]), b["data"]) != b["data"]:
-                raise ValueError(f"{path} is the result on other data of {b['set']}: move it, or give another --out")
-        now = {"time": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": round(time.perf_counter() - start)}
-        write_result(path, sign(form, suite, encoder, found, {**provenance(), **now}))
+        was, now = (
+            {(b["set"], b["task"]): b["data"] for b in one.get("blocks", ()) if "data" in b} for one in (old, found)
+        )
+        for key in (key for key in was if now.get(key) != was[key]):
+            what = f"other data of {key[0]}" if key in now else f"{': '.join(key)}, which is not run now"
+            raise ValueError(f"{path} is the result on {what}: move it, or give another --out")
+        took = {"time": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": round(time.perf_counter() - start)}
+        write_result(path, sign(form, suite, encoder, found, {**provenance(), **took}))
         for part in (out / "parts").glob(f"{digest(encoder)[:16]}-*.json"):
             part.unlink()
     return path

@@ -62,7 +62,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except (ValueError, OSError, MemoryError) as error:
         text = " ".join(str(error).split()) or type(error).__name__
-        if arguments[0] not in HEAVY:  # here the options of a dataset are --path, not --data.path as for pretrain
+        text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)  # a terminal would obey it
+        # Here the options of a dataset are --path, not --data.path as for pretrain.
+        if arguments[0] not in HEAVY and "Unrecognized" not in text:
             where = "" if arguments[0] == "data" else " of mvitac data pack"
             text = re.sub(r"--data\.([\w-]+)", rf"--\1{where}", text)
         print(f"mvitac: error: {text}", file=sys.stderr)

@@ -273,11 +273,16 @@ def ablate(policy: Policy, episodes: Episodes) -> dict[str, Any]:
         if episodes.actions is not None:
             own = away(normal, wanted, scale)
         for sense, kind in ((sense, kind) for sense in episodes.senses for kind in KINDS):
-            changed, lost, _ = act(policy, episodes, sense, kind)
+            changed, lost, there = act(policy, episodes, sense, kind)
             advance()
+            # Of an episode that ends earlier then, its last step stands for those after it.
+            pairs = zip(steps, there, strict=True)
+            same = np.concatenate([each[np.minimum(np.arange(len(one)), len(each) - 1)] for one, each in pairs])
+            changed, lost = changed[same], lost[same]
+            both = [each[: len(other)] for each, other in zip(kept, there, strict=True)]
             worse = (lost if episodes.actions is None else away(changed, wanted, scale)) - own
             of = {part: _paired(worse, each) for part, each in parts.items()}
-            paired = {"change": _paired(away(changed, normal, scale), kept), "error": _paired(worse, kept), "parts": of}
+            paired = {"change": _paired(away(changed, normal, scale), both), "error": _paired(worse, kept), "parts": of}
             rows.append({"sense": sense, "kind": kind, **paired})
         again, *_ = act(policy, episodes)  # last: what a policy keeps adds up
     if again.shape != normal.shape or away(again, normal, scale).max() > SAME:

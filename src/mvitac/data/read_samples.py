@@ -60,7 +60,7 @@ class Reader:
                 read = self.source.read(number)
                 samples = [one for one in read if isinstance(one, Sample)]
                 images = {m: [self._image(one, m) for one in samples] for m in stored}
-            except (ValueError, OSError) as error:
+            except (ValueError, OSError, LookupError) as error:  # LookupError: an array shorter than the rows say
                 part.damaged.append([self.items[number], str(error)])
                 continue
             part.columns += [sample.columns for sample in samples]

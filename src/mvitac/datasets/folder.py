@@ -23,6 +23,7 @@ from mvitac.datasets.table.image_refs import ARRAYS
 from mvitac.datasets.table.manifest import READERS, Manifest, read_manifest
 from mvitac.datasets.table.parquet import read_parquet
 from mvitac.datasets.table.table import RecordedConfig
+from mvitac.system.files import walk
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +46,7 @@ class FolderConfig(RecordedConfig):
         tables = [f for f in files if f.suffix.lower() in READERS and (f == self.path or f.stem == "manifest")]
         if len(tables) > 1:
             raise ValueError(f"{self.path} holds {' and '.join(f.name for f in tables)}: give the path of one of them")
-        parquet = tables if tables or alone else sorted(self.path.rglob("*.parquet"))
+        parquet = tables if tables or alone else sorted(walk(self.path))
         parquet = [file for file in parquet if file.suffix.lower() == ".parquet"]
         shown = read_parquet(self.path, parquet, self.vectors()) if parquet else None
         arrays = [file for file in files if file.name.lower().endswith(ARRAYS)]

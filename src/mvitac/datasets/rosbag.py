@@ -25,7 +25,7 @@ from mvitac.datasets.table.image_refs import ImageRef
 from mvitac.datasets.table.manifest import Manifest, Row, text_of
 from mvitac.datasets.table.table import RecordedConfig
 from mvitac.registry import unknown
-from mvitac.system.files import brief, check_ordinary
+from mvitac.system.files import brief, check_ordinary, walk
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +53,10 @@ class RosbagConfig(RecordedConfig):
         path, alone = self.path, self.path.suffix == ".bag" or (self.path / "metadata.yaml").is_file()
         bags = [path] if alone else []
         if not alone and path.is_dir():
-            bags = sorted([*(file.parent for file in path.rglob("metadata.yaml")), *path.rglob("*.bag")])
-            for file in sorted([*path.rglob("*.mcap"), *path.rglob("*.db3"), *path.rglob("*.bag.active")]):
+            found = sorted(walk(path))
+            ros2 = (file.parent for file in found if file.name == "metadata.yaml")
+            bags = sorted([*ros2, *(file for file in found if file.suffix == ".bag")])
+            for file in (file for file in found if file.name.endswith((".mcap", ".db3", ".bag.active"))):
                 if file.parent not in bags:
                     raise ValueError(f"{file} was not closed (no metadata.yaml): ros2 bag reindex, or rosbag reindex")
         if not bags:
@@ -108,7 +110,7 @@ def _opened(bag: Path) -> Iterator[Any]:
         from rosbags.typesys import Stores, get_typestore
     except ModuleNotFoundError:
         raise ValueError(f"{bag} needs rosbags: pip install 'mvitac[rosbags]'") from None
-    for file in [bag] if bag.is_file() else bag.rglob("*"):
+    for file in [bag] if bag.is_file() else walk(bag):
         check_ordinary(file)  # a pipe never ends
         if file.suffix == ".db3" and file.stat().st_size % 512:  # less than its least page: sqlite would read zeros
             raise ValueError(f"{file} is cut off: fetch it again")

@@ -41,7 +41,7 @@ def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
         text += [f"**{task}**: {TARGETS}"] * bool(task) + ["", *pipes(heads, rows)]
     if rows := retrieval_rows(result["retrieval"]):
         text += pipes(["retrieval", "", *(f"{name} %" for name in RETRIEVAL)], rows)
-    heads = ["cost of one run", "from", "seeds", "steps", "pairs", "images seen", "trained weights", "seconds"]
+    heads = ["cost of one run", "from", "seeds", "steps", "pairs", "images encoded", "trained weights", "seconds"]
     rows = []
     for c in result["cost"]:
         numbers = [str(c[key]) for key in ("row", "pairs_of", "seeds", "steps", "pairs", "images")]
@@ -126,8 +126,8 @@ def _significance(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> 
     groups = {record["task"]: num_groups_of(record) for record in result["records"]}
     least = ", ".join(f"{task} {_p(least_p(num))} ({result['group_by']}s: {num})" for task, num in groups.items())
     return (
-        f"p is of the difference to {plan.reference} on the same test rows, where both have several seeds, not corrected"
-        f" for the number of rows. Smallest possible p: {least}."
+        f"p is of the difference to {plan.reference} on the same test rows, where it has several seeds, not corrected for"
+        f" the number of rows. Smallest possible p: {least}."
     )
 
 

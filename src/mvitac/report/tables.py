@@ -12,7 +12,12 @@ from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import columns_of, error_text, headline, percent, sources_of, with_interval
 from mvitac.evaluation.scores import grouped, leaks_in
 
-PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
+PROBE_NAMES = {
+    "linear": "logistic regression",
+    "paper": "the paper's probe",
+    "knn": "20 nearest neighbours",
+    "own": "the head that was trained with the encoders",
+}
 NUM_BESIDE = 3  # sources side by side in a table of classes
 RETRIEVAL = ("R@1", "R@5", "R@10", "chance R@5")  # columns of a retrieval table, in percent
 

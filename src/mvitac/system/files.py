@@ -72,6 +72,20 @@ def check_ordinary(path: Path) -> None:
         raise ValueError(f"{path} is neither a file nor a folder: choose another place")
 
 
+def walk(folder: Path) -> Iterator[Path]:
+    """Every path below ``folder``, but for those in hidden folders; OSError if a folder cannot be read.
+
+    ``Path.rglob`` leaves such a folder out without a word.
+    """
+
+    def stop(error: OSError) -> None:
+        raise error
+
+    for place, folders, files in os.walk(folder, onerror=stop):
+        yield from (Path(place, name) for name in (*folders, *files))
+        folders[:] = [name for name in folders if not name.startswith(".")]
+
+
 def check_place(path: Path) -> None:
     """Raise ValueError if ``path`` cannot be written. Call it before the work whose result is written there."""
     parent = next((p for p in path.absolute().parents if os.path.lexists(p)), path)

@@ -59,7 +59,7 @@ class Log:
         now = time.perf_counter()
         speed = (step - self.since_step) * self.batch_size / max(1e-9, now - self.since)
         self.since, self.since_step = now, step
-        self._write({"step": step, **losses, "lr": lr, "pairs_per_s": round(speed, 1)})
+        self._write({**losses, "step": step, "lr": lr, "pairs_per_s": round(speed, 1)})
         self.loss, self.speed = f"{losses['loss']:.2f}", f"{speed:.0f}"
 
     def advance(self, step: int) -> None:

@@ -50,6 +50,8 @@ class Step:
             torch.manual_seed(seed)
             with self.autocast():
                 losses = self.forward(chunks[0]())
+            if not isinstance(losses, dict) or getattr(losses.get("loss"), "ndim", 1):
+                raise ValueError(f"{type(self.method).__name__} returned no dict with a scalar tensor 'loss'")
             losses["loss"].backward()
         else:
             losses = self._backward_by_chunks(chunks, seed)

@@ -22,7 +22,7 @@ import numpy as np
 from mvitac.data.images import MAX_PIXELS
 from mvitac.datasets.table.image_refs import ArrayRow, ImageRef, entry, open_arrays
 from mvitac.datasets.table.manifest import Manifest, text_of
-from mvitac.system.files import check_ordinary
+from mvitac.system.files import check_ordinary, walk
 
 USUAL = ("vision", "touch", "left", "right", "background")
 """Names of image datasets that are found without being asked for."""
@@ -51,7 +51,7 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
     notes: dict[str, None] = {}
     seen = ""
     for file in files:
-        for inner in file.rglob("*"):
+        for inner in walk(file) if file.is_dir() else ():
             if inner.is_symlink():
                 raise ValueError(f"{inner} is a link: copy what it shows into {file}")
             check_ordinary(inner)  # a pipe never ends

@@ -18,7 +18,7 @@ from mvitac.data.video import frame_times
 from mvitac.datasets.table.columns import with_elements
 from mvitac.datasets.table.image_refs import Frame, ImageRef
 from mvitac.datasets.table.manifest import READERS, Manifest, Row, read_manifest, text_of
-from mvitac.system.files import digest
+from mvitac.system.files import check_ordinary, digest
 
 
 def nearest(times: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -35,12 +35,12 @@ def times_of(video: Path) -> np.ndarray:
     """Return the times [N] of the frames in seconds: of the file VIDEO_timestamps.csv or .txt, else of the container."""
     times = frame_times(video)
     beside = [video.with_name(f"{video.stem}_timestamps{suffix}") for suffix in (".txt", *READERS)]
-    found = [file for file in beside if file.is_file()]
+    found = [file for file in beside if os.path.lexists(file)]  # also a link to nothing
     if not found:
         return times
     if len(found) > 1:
         raise ValueError(f"{found[0]} and {found[1].name} both have the times of {video.name}: remove one")
-    file = found[0]
+    check_ordinary(file := found[0])  # a pipe never ends
     if file.suffix == ".txt":
         stamps = seconds([line.strip() for line in file.read_text(errors="replace").splitlines() if line.strip()], file)
     else:

@@ -16,7 +16,7 @@ from mvitac.data.video import VIDEOS
 from mvitac.datasets.table.clocks import nearest, times_of
 from mvitac.datasets.table.image_refs import Frame, ImageRef
 from mvitac.datasets.table.manifest import READERS, Manifest, Row
-from mvitac.system.files import digest
+from mvitac.system.files import digest, walk
 
 CAMERAS = ("touch", "left", "right", "vision")
 EVERY = 5
@@ -78,7 +78,7 @@ def _split_rows(root: Path, split: str, plain: str, every: int) -> list[Row]:
 def _images_below(folder: Path) -> dict[str, Path]:
     """Return the images below ``folder`` by their path in it, without the suffix."""
     found: dict[str, Path] = {}
-    for path in sorted(folder.rglob("*")):
+    for path in sorted(walk(folder)):
         if path.is_dir() and path.is_symlink() and "/." not in f"/{path.relative_to(folder).as_posix()}":
             raise ValueError(f"{path} is a link to a folder: put the folder in its place, or take it away")
         if path.suffix.lower() in IMAGES and not path.is_dir():  # a link to nothing is a damaged image
@@ -98,7 +98,7 @@ def list_videos(path: Path, names: Sequence[str], plain: str, every: int | None,
     """
     plain, names = "" if names else plain, tuple(dict.fromkeys((*names, *CAMERAS)))
     recordings: dict[str, dict[str, Path]] = {}
-    for video in sorted(path.rglob("*")) if path.is_dir() else [path]:
+    for video in sorted(walk(path)) if path.is_dir() else [path]:
         if video.suffix.lower() in VIDEOS:
             parts = [*video.relative_to(path).parts[:-1], video.stem] if path.is_dir() else [video.stem]
             camera = next((name for name in names if name in parts), plain)

@@ -59,7 +59,7 @@ class ImageRef:
             return self.path
         try:  # memory-mapped: a header may claim any shape
             return np.load(self.path, mmap_mode="r", allow_pickle=False)
-        except ValueError as error:
+        except (ValueError, TypeError, OverflowError) as error:
             raise ValueError(f"{self} cannot be read as an array ({brief(error)})") from None
 
     @staticmethod

@@ -12,6 +12,7 @@ from mvitac.data.images import difference, fit, shrink
 from mvitac.data.source import Lost, Sample, Stamp, stamp_of
 from mvitac.datasets.table.image_refs import Damage, ImageRef, mean_image, read_all
 from mvitac.datasets.table.manifest import Manifest
+from mvitac.system.files import walk
 
 NUM_NO_CONTACT = 16  # number of no-contact frames that are averaged to a sensor's background
 Background = tuple[tuple[ImageRef, ...], ...]
@@ -62,7 +63,7 @@ def backgrounds(
 
 def folder_stamp(path: str) -> Stamp:
     """Return the stamp of a folder: the size of its files, and when the last was written."""
-    found = [stamp_of(str(file)) for file in Path(path).rglob("*") if file.is_file()]
+    found = [stamp_of(str(file)) for file in walk(Path(path)) if file.is_file()]
     return sum(size for size, _ in found), max((time for _, time in found), default=0)
 
 

@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 from mvitac.data.video import VIDEOS
 from mvitac.datasets.table.image_refs import Frame, ImageRef
 from mvitac.registry import unknown
-from mvitac.system.files import CONTROL, brief, digest, digest_file, parse_json
+from mvitac.system.files import CONTROL, brief, digest, digest_file, parse_json, walk
 
 NAN = ("nan", "NaN", "NAN")  # how programs write a missing number. "Nan" is a name.
 Row = dict[str, str]
@@ -180,6 +180,7 @@ def in_clone(path: Path, inside: str, pattern: str, url: str) -> Path:
     """Return folder ``inside`` of a clone of ``url`` at ``path``, or ``path`` itself; it must contain ``pattern``."""
     for root in (path / inside, path):
         if next(root.glob(pattern), None) is not None:
+            list(walk(root))  # OSError for a folder that may not be read
             return root
     raise ValueError(f"{path} holds no {inside}/{pattern}: git clone {url}, and give the clone as --data.path")
 
