@@ -28,15 +28,7 @@ from tyro.conf import Fixed
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, row_pairs
-from mvitac.nn.encoders import (
-    EncoderConfig,
-    Encoders,
-    Head,
-    build_trunk,
-    draws_random_numbers,
-    features_of,
-    num_features,
-)
+from mvitac.nn.encoders import Encoders, Head, build_trunk, draws_random_numbers, features_of, num_features
 from mvitac.nn.losses import info_nce
 from mvitac.nn.momentum import Momentum
 from mvitac.system.threads import in_branches
@@ -132,10 +124,10 @@ def possible_losses(spec: DataSpec) -> tuple[str, ...]:
 class Tower(nn.Module):
     """An encoder with two heads: images [B, C, H, W] to embeddings (z intra, z inter), in one pass of the trunk."""
 
-    def __init__(self, config: MViTacConfig, encoder: EncoderConfig, channels: int, frames: int) -> None:
+    def __init__(self, config: MViTacConfig, trunk: nn.Module) -> None:
         super().__init__()
-        self.trunk = build_trunk(encoder, channels, frames)
-        sizes = num_features(self.trunk), config.hidden, config.out
+        self.trunk = trunk
+        sizes = num_features(trunk), config.hidden, config.out
         self.intra = Head(*sizes, dropout=config.dropout, norm=config.head_norm)
         self.inter = Head(*sizes, dropout=config.dropout, norm=config.head_norm)
 
@@ -156,8 +148,9 @@ class MViTac(Contrastive):
         super().__init__()
         self.config = config
         # vision: theta, phi_v (intra), phi_t (inter); touch: psi, Phi_t (intra), Phi_v (inter)
-        towers = {m: Tower(config, encoder[m], spec.channels(m), spec.frames(m)) for m in spec.modalities}
-        self.query = nn.ModuleDict(towers)
+        self.query = nn.ModuleDict()
+        for m in spec.modalities:
+            self.query[m] = Tower(config, build_trunk(encoder[m], spec.channels(m), spec.frames(m)))
         momentum = self.query if config.keys == "momentum" else {}
         self.key = nn.ModuleDict({m: Momentum(tower) for m, tower in momentum.items()})
 
