@@ -148,9 +148,8 @@ class Calandra(Source):
         self._grasps = [grasp for grasp in everything if grasp.damage or grasp.object in self._splits]
 
     def spec(self) -> DataSpec:
-        partial = ", partial" if len(self._files) < NUM_SHARDS else ""
         return DataSpec(
-            name=f"calandra ({self.config.split}{partial})",
+            name=f"calandra ({self.config.split}{', partial' if len(self._files) < NUM_SHARDS else ''})",
             vision_channels=3,
             touch_channels=6,
             tasks=tuple(TASKS[asked] for asked in self.config.ask),

@@ -27,9 +27,9 @@ import pyarrow.parquet as pq
 from mvitac.data.stamps import number_of
 from mvitac.data.video import frame_times
 from mvitac.datasets.table.clocks import nearest
-from mvitac.datasets.table.image_refs import Frame, ImageRef
+from mvitac.datasets.table.image_refs import Frame, ImageRef, Refs
 from mvitac.datasets.table.manifest import READERS, Manifest, Row
-from mvitac.datasets.table.parquet import Refs, add_file
+from mvitac.datasets.table.parquet import add_file
 from mvitac.datasets.table.table import RecordedConfig
 from mvitac.registry import unknown
 from mvitac.system.files import brief, check_ordinary, fields_of, read_json
@@ -158,8 +158,7 @@ def choose(cameras: Sequence[str], vision: str | None, touch: tuple[str, ...], w
     if not touch and len(felt) > 2:
         raise ValueError(f"{where} has {len(felt)} cameras that may be touch ({', '.join(felt)}): choose by touch")
     if not touch and felt:
-        usual: tuple[str, ...] = ("touch",) if len(felt) == 1 else ("left", "right")
-        names = dict(zip(usual, felt, strict=True))
+        names = dict(zip(("touch",) if len(felt) == 1 else ("left", "right"), felt, strict=True))
     if vision:
         names[vision] = vision
     elif vision is None and (left := [key for key in seen if key not in touch]):

@@ -21,7 +21,7 @@ from mvitac.data.images import ros_pixels
 from mvitac.datasets.table.clocks import check_moves, joined, nearest
 from mvitac.datasets.table.columns import element_of
 from mvitac.datasets.table.folders import recording_row
-from mvitac.datasets.table.image_refs import ImageRef
+from mvitac.datasets.table.image_refs import ImageRef, Refs
 from mvitac.datasets.table.manifest import Manifest, Row, text_of
 from mvitac.datasets.table.table import RecordedConfig
 from mvitac.registry import unknown
@@ -66,7 +66,7 @@ class RosbagConfig(RecordedConfig):
         named = *named, self.group, self.touch_group, self.split, self.sensor
         smooth, every = self.numbers() if self.interpolate == "linear" else (), self.every or 1
         rows: list[Row] = []
-        images: dict[str, list[ImageRef | None]] = {topic: [] for topic in cameras}
+        images: Refs = {topic: [] for topic in cameras}
         dropped, same = 0, Counter[str]()
         for bag in bags:
             seen = _read(bag, cameras, [name for name in dict.fromkeys(named) if name])

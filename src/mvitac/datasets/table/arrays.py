@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from mvitac.data.images import MAX_PIXELS
-from mvitac.datasets.table.image_refs import ArrayRow, ImageRef, entry, open_arrays
+from mvitac.datasets.table.image_refs import ArrayRow, Refs, entry, open_arrays
 from mvitac.datasets.table.manifest import Manifest, text_of
 from mvitac.system.files import check_ordinary, walk
 
@@ -33,7 +33,6 @@ MAX_NUMBERS = 100_000_000
 MAX_TEXT = 200
 """Characters of the longest attribute that is a column. robomimic keeps whole simulator files in attributes."""
 MAGIC = (b"\xff\xd8", b"\x89P")  # first bytes of a JPEG and of a PNG
-Refs = dict[str, list[ImageRef | None]]
 OWN = ("id", "demo", "frame")  # columns that episodes give
 LeftOut = dict[str, str]  # name of what is no column -> why
 
@@ -69,10 +68,9 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
                 cells |= _columns(demo, datasets, num, refs, vectors, left_out)
                 notes |= {f"{c} of {file.name} is left out, ours has this name": None for c in OWN if c in cells}
                 notes |= dict.fromkeys(_unwritten(file, {n: d for n, d in datasets.items() if n in {**refs, **cells}}))
-                episodes = _episodes(demo, everything.get("meta/episode_ends"), num)
                 for column in {**found, **refs}:
                     found.setdefault(column, [None] * len(rows)).extend(refs.get(column, [None] * num))
-                for i, (episode, frame) in enumerate(episodes):
+                for i, (episode, frame) in enumerate(_episodes(demo, everything.get("meta/episode_ends"), num)):
                     own = dict(zip(OWN, (f"{episode}/{frame}", episode, str(frame)), strict=True))
                     rows.append({column: texts[i % len(texts)] for column, texts in cells.items()} | own)
             seen = _seen(everything)

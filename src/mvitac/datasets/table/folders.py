@@ -14,7 +14,7 @@ from mvitac.data.pack_table import SPLITS
 from mvitac.data.stamps import in_order, stamped
 from mvitac.data.video import VIDEOS
 from mvitac.datasets.table.clocks import nearest, times_of
-from mvitac.datasets.table.image_refs import Frame, ImageRef
+from mvitac.datasets.table.image_refs import Frame, Refs
 from mvitac.datasets.table.manifest import READERS, Manifest, Row
 from mvitac.system.files import digest, walk
 
@@ -63,7 +63,6 @@ def _split_rows(root: Path, split: str, plain: str, every: int) -> list[Row]:
     rows = []
     for i, key in enumerate(keys):
         row = {n: images[key].relative_to(root).as_posix() if key in images else "" for n, images in found.items()}
-        more = {"split": split} if split else {}
         if not flat:
             label, *below = key.split("/")
             row |= {"label": label, "group": key.rpartition("/")[0] if len(below) > 1 else f"{split}/{key}"}
@@ -71,7 +70,7 @@ def _split_rows(root: Path, split: str, plain: str, every: int) -> list[Row]:
             continue
         else:
             row |= recording_row(base.resolve().name, i, None if times is None else float(times[i]))
-        rows.append({**row, **more})
+        rows.append(row | {"split": split} if split else row)
     return rows
 
 
@@ -112,7 +111,7 @@ def list_videos(path: Path, names: Sequence[str], plain: str, every: int | None,
         return None
     cameras = [name for name in names if any(name in files for files in recordings.values())]
     rows: list[Row] = []
-    images: dict[str, list[ImageRef | None]] = {camera: [] for camera in cameras}
+    images: Refs = {camera: [] for camera in cameras}
     away, alone = 0.0, 0
     for recording, files in sorted(recordings.items()):
         times = {camera: times_of(file) for camera, file in files.items()}

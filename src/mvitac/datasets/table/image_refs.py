@@ -24,6 +24,7 @@ from mvitac.system.files import brief, check_ordinary
 ARRAYS = (".h5", ".hdf5", ".zarr", ".zarr.zip")
 
 Damage = dict["ImageRef", str]  # reference of a damaged image -> what is wrong with it
+Refs = dict[str, list["ImageRef | None"]]  # column -> each row's image
 
 
 @dataclass(frozen=True, slots=True, order=True)

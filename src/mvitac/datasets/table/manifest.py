@@ -21,7 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mvitac.data.video import VIDEOS
-from mvitac.datasets.table.image_refs import Frame, ImageRef
+from mvitac.datasets.table.image_refs import Frame, ImageRef, Refs
 from mvitac.registry import unknown
 from mvitac.system.files import CONTROL, brief, digest, digest_file, parse_json, walk
 
@@ -39,7 +39,7 @@ class Manifest:
     digest: str
     numbers: Sequence[int]
     """Number of each row, for messages and ids."""
-    images: dict[str, list[ImageRef | None]] = field(default_factory=dict)
+    images: Refs = field(default_factory=dict)
     """Image columns that the reader resolved itself; other image columns hold paths."""
     labels: tuple[str, ...] = ()
     """Default label columns."""
@@ -51,13 +51,7 @@ class Manifest:
     """What is printed with every result."""
 
     @classmethod
-    def of(
-        cls,
-        path: Path,
-        rows: Iterable[Mapping[str, Any]],
-        images: dict[str, list[ImageRef | None]] | None = None,
-        **known: Any,
-    ) -> "Manifest":
+    def of(cls, path: Path, rows: Iterable[Mapping[str, Any]], images: Refs | None = None, **known: Any) -> "Manifest":
         """Return the table of ``rows`` that a reader made from ``path``; cells that a row lacks are empty.
 
         Cells that are no text become one by ``text_of``. ``images`` and ``known`` are other fields of the table.
@@ -132,9 +126,8 @@ class Manifest:
 
         Else two ways to type a name would be two classes, or one object in train and in test.
         """
-        images = {column: self.refs(column) for column in columns}
         rows = [{name: cell if name in paths else normal(cell) for name, cell in row.items()} for row in self.rows]
-        return replace(self, rows=rows, images=images)
+        return replace(self, rows=rows, images={column: self.refs(column) for column in columns})
 
     def refs(self, column: str) -> list[ImageRef | None]:
         """Return each row's image in ``column``; None where the cell is empty.

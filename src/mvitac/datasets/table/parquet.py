@@ -13,11 +13,10 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from mvitac.datasets.table.image_refs import ImageRef, ParquetCell
+from mvitac.datasets.table.image_refs import ParquetCell, Refs
 from mvitac.datasets.table.manifest import Manifest, Row, text_of
 from mvitac.system.files import brief, check_ordinary, parse_json
 
-Refs = dict[str, list[ImageRef | None]]
 NAMES = {"train": "train training", "val": "val validation valid dev", "test": "test testing eval evaluation"}
 SPLITS = {name: split for split, names in NAMES.items() for name in names.split()}  # as the datasets library names them
 

@@ -2,7 +2,7 @@
 
 import os
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +23,9 @@ def assign_splits(
     class number of each row for each task (-1 = unlabelled); the shares are fractions of the groups.
     """
     votes: dict[str, Counter[int]] = {group: Counter() for group in groups}
-    known: set[str] = set()
     for i, group in enumerate(groups):
         votes[group].update([target[i] for target in targets[:1] if target[i] >= 0])
-        if not targets or any(target[i] >= 0 for target in targets):
-            known.add(group)
+    known = {group for i, group in enumerate(groups) if not targets or any(target[i] >= 0 for target in targets)}
     strata: dict[int, list[str]] = defaultdict(list)
     for group in sorted(known):
         # Ties go to the smaller class number, so that the result does not depend on the order of rows.
@@ -46,15 +44,14 @@ def assign_splits(
 
 
 def group_by_video(
-    root: Path, numbers: Sequence[int], refs: Iterable[Sequence[ImageRef | None]]
+    root: Path, numbers: Sequence[int], refs: Sequence[Sequence[ImageRef | None]]
 ) -> tuple[str, list[str]]:
     """What a group is ("video" or "row") and the group of each row, for rows that no column groups.
 
     Videos that occur in the same row are one group. A row of image files is its own group. ``refs`` has one reference
     per row for each image column.
     """
-    columns = list(refs)
-    rows = [[column[i] for column in columns] for i in range(len(numbers))]
+    rows = [[column[i] for column in refs] for i in range(len(numbers))]
     videos = [[os.path.relpath(ref.path, root) for ref in row if isinstance(ref, Frame)] for row in rows]
     parent: dict[str, str] = {}  # union-find
     for shown in videos:

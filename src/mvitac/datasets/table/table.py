@@ -290,9 +290,8 @@ class Rows(Source):
         found = images.backgrounds(table, self._touch, grounds, self._sensor, empty)
         if empty is None:
             return table, found
-        kept = [not none for none in empty]
-        found = [ground for ground, keep in zip(found, kept, strict=True) if keep]
-        return table.filtered(kept, f"every row meets {' and '.join(config.no_contact)}"), found
+        found = [ground for ground, none in zip(found, empty, strict=True) if not none]
+        return table.filtered([not none for none in empty], f"every row meets {' and '.join(config.no_contact)}"), found
 
     def _assign(
         self, table: Manifest, whole: dict[str, list[str]], tasks: Sequence[AnyTask], labels: Sequence[Sequence[int]]
