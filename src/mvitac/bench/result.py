@@ -67,9 +67,8 @@ def sign(
     form: tuple[str, int], suite: Any, encoder: dict[str, Any], found: dict[str, Any], here: dict[str, Any]
 ) -> dict[str, Any]:
     """The whole result with its digest. ``found`` is what was measured, ``here`` ``provenance``, with the time."""
-    versions = here.pop("versions")
     value = {"format": form[0], "format_version": form[1], "suite": suite.definition(), "suite_digest": suite.digest()}
-    value |= {"encoder": encoder, "versions": versions, **found}
+    value |= {"encoder": encoder, "versions": here.pop("versions"), **found}
     return {**value, "digest": digest(value), "about": here}
 
 

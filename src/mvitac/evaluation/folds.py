@@ -22,8 +22,7 @@ def fold_splits(pack: Pack, task: AnyTask, num: int, learned: Sequence[Source]) 
     """
     known = pack.answered(task) & np.isin(pack.column(task.split), ("train", "val", "test"))
     ids, names = row_hashes(pack)
-    none = np.zeros(0, np.uint64)
-    of = {key: np.concatenate([none, *(getattr(source, key) for source in learned)]) for key in KEYS}
+    of = {key: np.concatenate([np.zeros(0, np.uint64), *(getattr(source, key) for source in learned)]) for key in KEYS}
     copied = np.isin(ids, of["ids"]) | known_images(pack, np.arange(pack.num), of["images"]).any(axis=1)
     seen = np.isin(names, np.concatenate([of["groups"], names[copied]]))
     rows = np.flatnonzero(known & ~seen)

@@ -76,8 +76,7 @@ def paired_difference(
         return mean, -most, most, None if one_seed else 1.0
     paired = [r["seed"] for r in ours] == [r["seed"] for r in theirs]
     seeds = _over_seeds(a - b, sizes) if paired else _over_seeds(a, sizes) + _over_seeds(b, sizes)
-    groups = _over_groups(a.mean(0) - b.mean(0), sizes)
-    margin, p = _margin_and_p(mean, groups, seeds, len(sizes))
+    margin, p = _margin_and_p(mean, _over_groups(a.mean(0) - b.mean(0), sizes), seeds, len(sizes))
     margin = margin if margin < 1000 else math.inf  # of R2, where the values of all groups but one are equal
     return mean, max(-most, mean - margin), min(most, mean + margin), None if one_seed else p
 

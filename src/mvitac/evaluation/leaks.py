@@ -136,9 +136,8 @@ class Scored:
         rest = [source.name for source in sources if not len(source.ids)]
         said = [name.removeprefix(DECLARED) for name in rest if name.startswith(DECLARED)]
         declared = dict.fromkeys(declared_leak(text, names or [self.pack.spec.name.split(" (")[0]]) for text in said)
-        unknown = len(rest) > len(said) or UNKNOWN in declared
         found += [leak for leak in declared if leak not in ("", UNKNOWN)]
-        return "; ".join(found) or (UNKNOWN if unknown else "")
+        return "; ".join(found) or (UNKNOWN if len(rest) > len(said) or UNKNOWN in declared else "")
 
 
 def declared_leak(trained_on: str | None, names: Sequence[str]) -> str:

@@ -28,9 +28,8 @@ def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_clas
     whole = {"accuracy": float((guess == y).mean()), "balanced_accuracy": float(recall), "macro_f1": float(f1)}
     whole |= {"auroc": auroc, "confusion": confusion_matrix(y, guess, labels=range(num_classes)).tolist()}
     class_groups = [len(np.unique(groups[y == k])) for k in range(num_classes)]
-    sizes = np.bincount(groups).tolist()
     correct = np.bincount(groups, weights=guess == y).astype(int).tolist()
-    by_group = {"num_test": len(y), "group_sizes": sizes, "group_correct": correct}
+    by_group = {"num_test": len(y), "group_sizes": np.bincount(groups).tolist(), "group_correct": correct}
     return {**whole, "class_groups": class_groups, **by_group}
 
 
@@ -123,15 +122,15 @@ def summarise(records: Sequence[dict[str, Any]], probe: str = "linear") -> dict[
     """Scores as task -> modality -> method or control -> mean, low, high, seeds, number of test groups (``by_cell``).
 
     Where test classes are uneven (``is_uneven``), "balanced" is the balanced accuracy. Of values, the score is R2, and
-    "targets" has the scores of each target (``targets_of``). With one test group R2 has no lower end: ``low`` is None.
-    "clipped" is ``most_clipped`` of ridge regression.
+    "targets" has the scores of each target (``targets_of``). With one test group R2 has no lower end: ``low`` is None, as
+    JSON has no infinity. "clipped" is ``most_clipped`` of ridge regression.
     """
     summary: dict[str, Any] = {}
     for (task, modality, source), found in by_cell(records, probe).items():
         mean, low, high = interval(found)
         seeds = [record["seed"] for record in found if record["seed"] is not None]
-        cell: dict[str, Any] = {"mean": mean, "low": _finite(low), "high": high, "seeds": seeds}
-        cell["groups"] = num_groups_of(found[0])
+        cell: dict[str, Any] = {"mean": mean, "low": low if math.isfinite(low) else None, "high": high}
+        cell |= {"seeds": seeds, "groups": num_groups_of(found[0])}
         if "targets" in found[0]:
             cell["targets"] = targets_of(found)
         if is_uneven(found[0]):
@@ -165,9 +164,8 @@ def per_class(records: Sequence[dict[str, Any]], classes: Mapping[str, Sequence[
         counts = np.sum([record["confusion"] for record in each], axis=0)
         about = zip(classes[task], np.sum(each[0]["confusion"], axis=1).tolist(), each[0]["class_groups"], strict=True)
         new = [{"class": name, "rows": rows, "groups": groups, "scores": {}} for name, rows, groups in about]
-        of_task = found.setdefault(task, {}).setdefault(modality, new)
         right, said, true = counts.diagonal(), counts.sum(0), counts.sum(1)
-        for k, one in enumerate(of_task):
+        for k, one in enumerate(found.setdefault(task, {}).setdefault(modality, new)):
             one["scores"][source] = [float(right[k] / n) if n else None for n in (said[k], true[k])]
     return found
 
@@ -189,9 +187,5 @@ def targets_of(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         mean, low, high = interval([one_target(record, t) for record in records])
         errors = {key: float(np.mean([record["targets"][t][key] for record in records])) for key in ("mae", "rmse")}
         about = {"name": target["name"], "unit": target["unit"]}
-        found.append({**about, "mean": mean, "low": _finite(low), "high": high, **errors})
+        found.append({**about, "mean": mean, "low": low if math.isfinite(low) else None, "high": high, **errors})
     return found
-
-
-def _finite(low: float) -> float | None:
-    return low if math.isfinite(low) else None  # JSON has no infinity

@@ -30,8 +30,7 @@ def score_values(y: np.ndarray, predicted: np.ndarray, groups: np.ndarray, targe
     for t, target in enumerate(targets):
         have = ~np.isnan(y[:, t])
         true, error, group = y[have, t], predicted[have, t] - y[have, t], groups[have]
-        terms = (np.ones(len(true)), abs(error), error**2, true, true**2)
-        for name, term in zip(SUMS, terms, strict=True):
+        for name, term in zip(SUMS, (np.ones(len(true)), abs(error), error**2, true, true**2), strict=True):
             sums[name].append(np.bincount(group, weights=term, minlength=num_groups).tolist())
         r2 = float(r_squared({name: np.array(sums[name][-1]).sum() for name in SUMS}))
         errors = {"r2": r2, "mae": float(abs(error).mean()), "rmse": float((error**2).mean() ** 0.5)}

@@ -78,6 +78,5 @@ class VICReg(Contrastive, config=VICRegConfig):
             with torch.autocast(first.device.type, enabled=False):
                 s, v = F.mse_loss(first, second), (variance(first) + variance(second)) / 2
                 c = covariance(first) + covariance(second)
-            weights = self.config
-            losses[modality] = weights.invariance * s + weights.variance * v + weights.covariance * c
+            losses[modality] = self.config.invariance * s + self.config.variance * v + self.config.covariance * c
         return with_sum(losses)

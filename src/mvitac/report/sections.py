@@ -77,9 +77,8 @@ def retrieval(study: Study) -> list[Markup]:
         return [html.paragraph(f"Not scored: it takes {needs}.")]
     by, num = study.pack.spec.group_by, found[0]["num_groups"]
     rows = [[row[0], row[1].replace("->", "→"), *row[2:]] for row in tables.retrieval_rows(found)]
-    muted = {row[0] for row in rows} - set(study.sources)
     columns = ["", "query → found", *(f"{k} %" for k in tables.RETRIEVAL)]
-    shown = html.table(columns, rows, muted=muted, label="retrieval")
+    shown = html.table(columns, rows, muted={row[0] for row in rows} - set(study.sources), label="retrieval")
     intro = f"Given one image, find its {by} among {num}, each represented by its mean embedding in the other modality."
     return [html.paragraph(intro), shown]
 

@@ -134,10 +134,9 @@ def touch(
     if not 0 <= through < len(choice):
         raise ValueError(f"through {through}: there are {len(choice)} sensors for one spot, give a smaller number")
     again = np.random.default_rng([_TAG, seed, category, instance, touch, 0, through]) if through else None
-    vision = _look(thing, again or eye, angle + (again or eye).normal(0, 0.1), place, size)
     turn = angle + finger.normal(0, 0.1)
     return {
-        "vision": vision,
+        "vision": _look(thing, again or eye, angle + (again or eye).normal(0, 0.1), place, size),
         "category": category,
         "soft": int(thing.soft),
         "rough": int(thing.rough),

@@ -104,9 +104,8 @@ def _record(setup: Setup, asked: Run, out: Path, start: Start | None, taken: dic
     """Write run.json and the hashes of the rows that the run learns from, and say what it starts from."""
     run, pack, val = setup.run, setup.pack, setup.pack.rows("val")
     before = [*(start.sources if start else []), *map(leaks.file_source, leaks.weights_files(run))]
-    chose = [leaks.source_of(pack, val, leaks.CHOSE)] if len(val) else []
     own, *others = leaks.with_ancestors(leaks.source_of(pack, setup.rows), before)
-    sources = [own, *chose, *others]
+    sources = [own, *([leaks.source_of(pack, val, leaks.CHOSE)] if len(val) else []), *others]
     if not (out / "run.json").exists():
         record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(setup.spec)}
         record |= {leaks.LEARNED: leaks.sources_digest(sources)}

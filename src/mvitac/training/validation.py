@@ -121,9 +121,8 @@ def _linear(
                 if len(torch.unique(y[have], dim=0)) < 2 or len(torch.unique(true[scored], dim=0)) < 2:
                     continue
                 guess = diagnostics.linear_probe(train_features[m][have], y[have], groups[have], z[m][scored])
-                errors = _errors(guess, true[scored])
                 sums = torch.zeros(int(by_group.max()) + 1, 2, dtype=torch.float64)
-                found.append(sums.index_add_(0, by_group[scored], errors))
+                found.append(sums.index_add_(0, by_group[scored], _errors(guess, true[scored])))
             if found:
                 cells[f"{m}/linear {task.name}"] = torch.stack(found)
     return cells
