@@ -273,8 +273,7 @@ def _impossible(record: dict[str, Any], num_groups: int, folds: int) -> str:
         return "it has more correct rows than rows" if (sums["correct"] > n).any() else ""
     least = 1 - 1e-6  # sums have ten digits
     error, squared = sums["error"], sums["squared_error"]
-    low, high = error**2 / np.maximum(n, 1), error**2
-    if ((error < 0) | (squared < least * low) | (least * squared > high)).any():
+    if ((error < 0) | (squared < least * (error**2 / np.maximum(n, 1))) | (least * squared > error**2)).any():
         return "its squared errors are smaller or larger than its errors allow"
     square, of = sums["squared_value"] * n, sums["value"] ** 2
     wrong = (square < least * of).any() or (least * square > of)[n == 1].any()

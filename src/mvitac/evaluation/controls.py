@@ -12,17 +12,8 @@ import torch.nn.functional as F
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import MODALITIES, AnyTask, DataSpec, Task
+from mvitac.evaluation import probe
 from mvitac.evaluation.few_labels import percent_of
-from mvitac.evaluation.probe import (
-    names_in,
-    probe_all,
-    probe_features,
-    probe_model,
-    probes_of,
-    score_rows,
-    seen_by,
-    split_rows,
-)
 from mvitac.evaluation.probe_config import Standardise
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.methods.simclr import SimCLRConfig
@@ -74,10 +65,10 @@ def controls_of(
     records = label_controls(pack, tasks, modalities, probes)
     starts, weights = starts_of(runs, specs or [pack.spec] * len(runs)), frozen_trunks(runs)
     sources = len(modalities) * (1 + len(starts) + len(weights)) + ("touch" in modalities)
-    num = sources * sum(len(probes_of(task, probes)) for task in tasks)
+    num = sources * sum(len(probe.probes_of(task, probes)) for task in tasks)
 
     def probed(model: Model, which: Sequence[str] = modalities) -> Records:
-        return probe_model(model, pack, tasks, which, probes, standardise)
+        return probe.probe_model(model, pack, tasks, which, probes, standardise)
 
     with work("fitting probes of the controls", num, "probes"):
         records += pixel_controls(pack, tasks, modalities, probes)
@@ -90,7 +81,7 @@ def controls_of(
             retrieval += _named("untrained", run.seed, ranked)
         for name, run in weights:
             # A modality that starts from random weights is no control, nor are both with it.
-            which = [m for m in modalities if all(run.encoder[own].weights != SCRATCH for own in names_in(m, pack))]
+            which = [m for m in modalities if SCRATCH not in {run.encoder[o].weights for o in probe.names_in(m, pack)}]
             records += _named(name, None, probed(fresh(run, pack.spec, pack.size), which))
     return records, retrieval
 
@@ -117,21 +108,21 @@ def label_controls(
     Where rows lack images, also on the rows of each of ``modalities``. Of values, a column gets a curve.
     """
     records = []
-    for task, modality in [(t, m) for t in tasks for m in ("none", *seen_by(pack, t, modalities))]:
-        rows, whole = split_rows(pack, task, modality), split_rows(pack, task).all
+    for task, modality in [(t, m) for t in tasks for m in ("none", *probe.seen_by(pack, t, modalities))]:
+        rows, whole = probe.split_rows(pack, task, modality), probe.split_rows(pack, task).all
         if modality != "none" and np.array_equal(rows.all, whole):
             continue
         if isinstance(task, Task):
-            guess, linear, kinds = "majority", "linear", probes_of(task, probes)
+            guess, linear, kinds = "majority", "linear", probe.probes_of(task, probes)
             answer = np.eye(len(task.classes))[np.bincount(pack.labels(task.name)[rows.fitted]).argmax()]
         else:
             guess, linear, kinds = "mean", "curve", ["curve", *filter(percent_of, probes)]
             answer = np.nanmean(pack.values(task)[rows.fitted], axis=0)
-        found = [(guess, "linear", score_rows(pack, task, rows.test, np.tile(answer, (len(rows.test), 1))))]
+        found = [(guess, "linear", probe.score_rows(pack, task, rows.test, np.tile(answer, (len(rows.test), 1))))]
         for name, columns in pack.spec.controls.items():
             x = np.stack([pack.column(column).astype(float) for column in columns], axis=1)
             if np.isfinite(x[whole]).all():  # else rows of a part of a mix that has no such control
-                fit = partial(probe_features, x[rows.all], pack, task, rows, seed=0, few_kind=linear)
+                fit = partial(probe.probe_features, x[rows.all], pack, task, rows, seed=0, few_kind=linear)
                 found += [(name, kind, fit(kind)[0]) for kind in kinds]
         for name, kind, result in found:
             known = {"task": task.name, "modality": modality, "probe": "linear" if kind == "curve" else kind}
@@ -142,11 +133,9 @@ def label_controls(
 def pixel_controls(
     pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str], probes: Sequence[str] = ("linear",)
 ) -> Records:
-    found = probe_all(partial(thumbnails, pack), pack, tasks, modalities, probes, 0)
-    records = _named("pixels", None, found)
+    records = _named("pixels", None, probe.probe_all(partial(thumbnails, pack), pack, tasks, modalities, probes, 0))
     if "touch" in modalities:
-        found = probe_all(partial(borders, pack), pack, tasks, ["touch"], probes, 0)
-        records += _named("border", None, found)
+        records += _named("border", None, probe.probe_all(partial(borders, pack), pack, tasks, ["touch"], probes, 0))
     return records
 
 

@@ -89,16 +89,15 @@ def touch_features(
         return features(model, pack, modality, rows)
     parts, sensors = [], pack.sensors[rows]
     for number in np.unique(sensors):
-        known, own = unlabelled_rows(pack, int(number)), rows[sensors == number]
         looks = pack.looks if isinstance(pack, RecolouredPack) and number in pack.new else [pack]
 
         def mean(rows: np.ndarray, looks: list[Pack]) -> np.ndarray:
             each = [features(model, look, modality, rows) for look in looks]
             return np.asarray(np.mean(each, axis=0, dtype=np.float32))
 
-        z = mean(own, looks)
+        z = mean(rows[sensors == number], looks)
         if "features" in standardise:
-            seen = mean(known, looks)
+            seen = mean(unlabelled_rows(pack, int(number)), looks)
             z = (z - seen.mean(0)) / spread(seen)
         parts.append(z)
     order = np.argsort(sensors, kind="stable")  # of the rows in ``parts``
