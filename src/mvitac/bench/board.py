@@ -97,9 +97,7 @@ def write_board(files: Sequence[Path], out: Path) -> Path:
 def gather(results: dict[str, dict[str, Any]]) -> Board:
     """Put the blocks of all results side by side. Only those on the same rows of data are one row of the page."""
     suite = suite_of(next(iter(results.values())))
-    rows: list[Row] = []
-    not_run: list[str] = []
-    differ: list[str] = []
+    rows, not_run, differ = list[Row](), list[str](), list[str]()
     for number, (one, ask) in enumerate((each, ask) for each in suite.sets for ask in each.tasks):
         forms: dict[tuple[str, str], list[tuple[str, dict[str, Any]]]] = {}
         for name, result in results.items():

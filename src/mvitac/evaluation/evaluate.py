@@ -272,8 +272,7 @@ def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:
             scored = {Path(r["run"]).resolve() for r in result["records"] if "run" in r}
             # Of one pack, the notes tell scores on val from those on test.
             notes = [*pack.spec.notes, *_unlearned((task, [pack]) for task in pack.spec.all_tasks)]
-            same = (result["pack"], result["notes"]) == (pack.digest, notes)
-            same &= result["models"] == _digests(paths)
+            same = (result["pack"], result["notes"], result["models"]) == (pack.digest, notes, _digests(paths))
     except ValueError as error:
         print(f"mvitac: {error}; the runs are probed again", file=sys.stderr)
         return None

@@ -45,10 +45,8 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
     are added; what the file calls so is left out.
     """
     rows: list[dict[str, str]] = []
-    found: Refs = {}
-    left_out: LeftOut = {}
+    found, left_out, seen = Refs(), LeftOut(), ""
     notes: dict[str, None] = {}
-    seen = ""
     for file in files:
         for inner in walk(file) if file.is_dir() else ():
             if inner.is_symlink():
@@ -64,8 +62,7 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
                 datasets = _datasets(opened[name] if name else opened)
                 refs = _images(file, name, datasets, images, MAX_ROWS - len(rows))
                 num = len(next(iter(refs.values())))
-                cells = _constants(opened, name, vectors)
-                cells |= _columns(demo, datasets, num, refs, vectors, left_out)
+                cells = _constants(opened, name, vectors) | _columns(demo, datasets, num, refs, vectors, left_out)
                 notes |= {f"{c} of {file.name} is left out, ours has this name": None for c in OWN if c in cells}
                 notes |= dict.fromkeys(_unwritten(file, {n: d for n, d in datasets.items() if n in {**refs, **cells}}))
                 for column in {**found, **refs}:

@@ -23,8 +23,7 @@ SPLITS = {name: split for split, names in NAMES.items() for name in names.split(
 
 def read_parquet(path: Path, files: Sequence[Path], vectors: Collection[str]) -> Manifest | None:
     """Return the table of ``files``, which are ``path`` or in this folder; None if they hold no images."""
-    rows: list[Row] = []
-    found: Refs = {}
+    rows, found = list[Row](), Refs()
     for file in files:
         before = len(rows)
         add_file(file, rows, found, vectors)

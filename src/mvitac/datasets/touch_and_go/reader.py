@@ -109,8 +109,7 @@ class TouchAndGo(Source):
             recording = list(own)
             self._chunks += [recording[i : i + CHUNK] for i in range(0, len(recording), CHUNK)]
         self._stamps = [one_stamp(stamps(found[chunk[0].recording], chunk)) for chunk in self._chunks]
-        notes = lists.leaks(listed) if config.split == "official" else []
-        notes += [lacking] * bool(missing)
+        notes = [*(lists.leaks(listed) if config.split == "official" else ()), *[lacking] * bool(missing)]
         # A part of the recordings may have no frame of the rough lists.
         self._spec = _spec(config, any(frame.rough >= 0 for frame in listed), tuple(notes), bool(missing))
         self._fingerprint = {
