@@ -86,8 +86,7 @@ def test_embed_takes_paths_arrays_tensors_and_pictures_alike(model: Model, pack:
     expected = model.embed(touch=stacked)["touch"]
     for form in (torch.from_numpy(stacked), torch.from_numpy(stacked).permute(0, 3, 1, 2), stacked / 255):
         assert torch.equal(model.embed(touch=form)["touch"], expected)
-    names = np.array([forms["name"]] * 2)  # as a column of a table
-    assert model.embed(touch=names)["touch"].shape == (2, 64)
+    assert model.embed(touch=np.array([forms["name"]] * 2))["touch"].shape == (2, 64)  # as a column of a table
 
 
 def test_floats_are_taken_as_levels_or_refused(model: Model, pack: Pack) -> None:

@@ -194,8 +194,7 @@ def test_controls_of_changed_data_are_redone(results: list[Path], smoke_run: Pat
     """A pack's digests of images and rows have no controls; a page does not mix both."""
     toys, out = find_suite(str(root / "toys.toml")), shutil.copytree(root, tmp_path / "root")
     pack = Pack(out / "stripes")
-    table = with_columns(pack, noise=pack.labels("pattern").astype(float)).table
-    pq.write_table(table, pack.path / "samples.parquet")
+    pq.write_table(with_columns(pack, noise=pack.labels("pattern").astype(float)).table, pack.path / "samples.parquet")
     seal(pack.path)
     second = run_bench([str(smoke_run)], toys, out / "results", out, About(name="again"))
     told = [read_result(path)["blocks"] for path in (results[0], second)]
@@ -571,9 +570,8 @@ def test_results_of_other_suites_are_refused(
         value["suite"]["name"] = "sim-v1"
         resigned(value)
 
-    old = changed(results[1], tmp_path / "old.json", of_v1, signed=True)
     says = "is of another sim-v1 than sim-v3 of this version: run the bench again"
-    assert says in said(capsys, "bench", "check", old)
+    assert says in said(capsys, "bench", "check", changed(results[1], tmp_path / "old.json", of_v1, signed=True))
     monkeypatch.setattr(suite, "SUITES", tmp_path)
     (tmp_path / "toys.toml").write_text(SUITE)
     assert main(["bench", "check", str(results[0])]) == 0

@@ -75,9 +75,8 @@ def refused(
     """Run a command that must be refused; returns its one line. ``left`` are new paths that may stay."""
 
     def refuse(command: str | list[str], *says: str, left: tuple[str, ...] = (), work: bool = False) -> str:
-        places = {"tmp": tmp_path, "pack": pack.path, "run": finished, "out": tmp_path / "out"}
         words = command.split() if isinstance(command, str) else command
-        for name, place in places.items():
+        for name, place in {"tmp": tmp_path, "pack": pack.path, "run": finished, "out": tmp_path / "out"}.items():
             words = [word.replace(f"{{{name}}}", str(place)) for word in words]
         traps = ((StepViews, "make"), (packing, "read_parts"), (probe_module, "features"))
         for module, name in () if work else traps:

@@ -65,11 +65,7 @@ def test_a_method_of_ones_own_is_known(smoke_run: Path, monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize(
     ("words", "again"),
-    [
-        ("pretrain --data packs/a --out 'my run'", " --resume"),
-        ("finetune imagenet --resume", ""),
-        ("compare --seeds 3", ""),
-    ],
+    [("pretrain --data a --out 'my run'", " --resume"), ("finetune imagenet --resume", ""), ("compare --seeds 3", "")],
 )
 def test_what_is_stopped_says_the_command_that_goes_on(
     words: str, again: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

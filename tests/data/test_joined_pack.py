@@ -55,7 +55,6 @@ def test_train_is_of_the_one_and_test_of_the_other(pack: Pack, negative: Pack) -
 @pytest.mark.parametrize("column", ["sensor", "lamp", "phase"])
 def test_columns_matter_that_probes_read(tmp_path: Path, column: str) -> None:
     """A name here, a number there: of no matter in a column beside, and text in one that says what a task is about."""
-
     task = replace(Toy().spec().tasks[0], only={"phase": "during"} if column == "phase" else {})
     packs = []
     for name, mark in (("a", "during"), ("b", 3)):
@@ -80,11 +79,10 @@ def test_what_cannot_be_compared_is_refused(pack: Pack, negative: Pack, tmp_path
         return {f"label_other {name}": sample.columns[f"label_{name}"] for name in ("pattern", "bright")}
 
     tasks = tuple(replace(task, name=f"other {task.name}") for task in Toy().spec().tasks)
-    waves = (Task(name="pattern", classes=("columns", "rows", "waves")),)
     cases: dict[str, Toy] = {
         r"instance '.*' is learned from in .* and scored in .*, one of \d+": altered(Toy(), elsewhere),
         "no task is in both packs: .* has pattern, bright, .* other pattern": altered(Toy(), renamed, tasks=tasks),
-        "class of pattern.*waves": altered(Toy(), tasks=waves),
+        "class of pattern.*waves": altered(Toy(), tasks=(Task(name="pattern", classes=("columns", "rows", "waves")),)),
     }
     for number, (says, source) in enumerate(cases.items()):
         with pytest.raises(ValueError, match=says):

@@ -96,12 +96,10 @@ def pressed(first: int = 0, unit: str = "N", kind: Any = 1, own_split: bool = Fa
 @pytest.mark.parametrize("other", [{"unit": "mN"}, {"own_split": True}, {"kind": "1"}, {}], ids=str)
 def test_values_keep_their_unit_rows_and_split(gel: Pack, tmp_path: Path, other: dict[str, Any]) -> None:
     """Where ``kind`` is a number here and a text there, the task is the same: conditions compare text."""
-    a = built(pressed(), tmp_path / "a")
-    b = built(pressed(60, **other), tmp_path / "b")
+    a, b = built(pressed(), tmp_path / "a"), built(pressed(60, **other), tmp_path / "b")
     mix = MixedPack({"a": a, "b": b, "gel": gel})
-    names = [task.name for task in mix.spec.values]
     apart = bool(other) and "kind" not in other
-    assert names == (["a/force", "b/force"] if apart else ["force"])
+    assert [task.name for task in mix.spec.values] == (["a/force", "b/force"] if apart else ["force"])
     for task in mix.spec.values:
         values = mix.values(task)[:, 0]
         there = np.isin(mix.column("part"), [task.name[0]] if apart else ["a", "b"])

@@ -150,7 +150,6 @@ def killed(*_: object) -> None:
 
 def almost_finished(path: Path, source: Source) -> Path:
     """What is left of packing ``source`` if the build is killed after the last part."""
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(packing._Partial, "finish", killed)
         with pytest.raises(KeyboardInterrupt):
@@ -218,9 +217,7 @@ def test_killed_while_it_is_finished(pack: Pack, tmp_path: Path, monkeypatch: py
     assert contents(tmp_path / "q") == contents(pack.path)
 
 
-def test_an_unfinished_pack_is_continued_by_its_own_data_and_leftovers_do_not_get_in(
-    pack: Pack, tmp_path: Path
-) -> None:
+def test_an_unfinished_pack_is_continued_by_its_own_data_and_no_leftovers_get_in(pack: Pack, tmp_path: Path) -> None:
     """Those of a build that was killed at its very end."""
     partial = almost_finished(tmp_path / "p", Toy())
     with pytest.raises(ValueError, match="unfinished pack of something else"):

@@ -36,9 +36,8 @@ class Presses(Source):
     order: tuple[int, ...] = (3, 0, 5, 1, 4, 2)
 
     def spec(self) -> DataSpec:
-        task = Task(name="late", classes=("early", "late"))
         known: Any = {"vision_channels": 3, "touch_channels": 3, "group_by": "object", "licence": "", "source": ""}
-        return DataSpec(name="presses", tasks=(task,), **known)
+        return DataSpec(name="presses", tasks=(Task(name="late", classes=("early", "late")),), **known)
 
     def items(self) -> list[str]:
         return [f"{t}-{f}" for f in self.order for t in range(TOUCHES) if (t, f) != (1, 3)]

@@ -100,8 +100,7 @@ def test_one_row_per_entry_of_the_first_axis(tmp_path: Path) -> None:
     values = ("force_n:N", "pose=pose[2]:mm,pose[1]:deg", "depth:mm")
     kind = np.array([i % 2 for i in range(20)], h5py.enum_dtype({"wood": 1, "metal": 0}, basetype="i"))
     file = write(tmp_path / "a.h5", flat(kind=kind))
-    config = FolderConfig(path=file, values=values, labels=("held", "kind"), **FLAT)
-    pack = packed(config, tmp_path / "pack")
+    pack = packed(FolderConfig(path=file, values=values, labels=("held", "kind"), **FLAT), tmp_path / "pack")
     assert [pack.spec.tasks[1].classes[i] for i in pack.column("label_kind")[:2]] == ["metal", "wood"]
     rows = np.array(levels(pack, "vision"))
     assert sorted(rows) == list(range(20)) and levels(pack, "touch") == (100 + rows).tolist()
@@ -184,8 +183,7 @@ def test_columns_of_episodes_are_ours(tmp_path: Path) -> None:
 
 
 def test_what_a_demonstration_lacks(tmp_path: Path) -> None:
-    twice = r"obs and next_obs of data/demo_0 hold the same images: name them obs/"
-    with pytest.raises(ValueError, match=twice):
+    with pytest.raises(ValueError, match=r"obs and next_obs of data/demo_0 hold the same images: name them obs/"):
         FolderConfig(path=demos(tmp_path), **DEMOS | {"touch": ("gel",)}).source()
     path = demos(tmp_path, **{"data/demo_1/force": None, "data/demo_3/obs/gel": None})
     with pytest.raises(ValueError, match=r"row 13 \(data/demo_3/0\) has no obs/gel path: .*--data\.allow-missing"):
@@ -432,7 +430,6 @@ def test_truncated_files(tmp_path: Path, keep: int, capsys: pytest.CaptureFixtur
 
 
 def claimed(name: str, **about: Any) -> Callable[[Path], object]:
-
     def change(path: Path) -> None:
         file = path / name / ".zarray"
         file.write_text(json.dumps(json.loads(file.read_text()) | about))

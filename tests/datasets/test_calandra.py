@@ -17,15 +17,8 @@ import pytest
 from mvitac.bench.suite import find_suite, open_set
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
-from mvitac.datasets.calandra import (
-    AUTHORS_TEST,
-    AUTHORS_TRAIN,
-    PHASES,
-    Calandra,
-    CalandraConfig,
-    list_grasps,
-    owners_shuffle,
-)
+from mvitac.data.spec import PHASES
+from mvitac.datasets.calandra import AUTHORS_TEST, AUTHORS_TRAIN, Calandra, CalandraConfig, list_grasps, owners_shuffle
 from mvitac.datasets.simulated import GraspsConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.probe import split_rows
@@ -288,13 +281,11 @@ def test_after_reaches_no_probe_unless_named_and_then_every_table_says_so(leakin
     """The same road on both packs: what 'during' does not show is at chance, what 'after' shows is not."""
     shown = {}
     for ask in (("during",), ("after",)):
-        pack = leaking_pack(leaking, tmp_path / ask[0], ask=ask)
-        run = smoke(pack, steps=2, eval_every=1)
+        run = smoke(leaking_pack(leaking, tmp_path / ask[0], ask=ask), steps=2, eval_every=1)
         session = ProbeConfig(probes=("linear", "knn"), modalities=("touch",))
         result = probe_runs([train(run, tmp_path / f"run-{ask[0]}", quiet=True)], session)
         print_summary(result, file := io.StringIO())
-        tables = file.getvalue()
-        shown[ask[0]] = result["summary"], tables, (tmp_path / f"run-{ask[0]}" / "log.jsonl").read_text()
+        shown[ask[0]] = result["summary"], file.getvalue(), (tmp_path / f"run-{ask[0]}" / "log.jsonl").read_text()
     honest, leaked = shown["during"], shown["after"]
     assert set(honest[0]) == {"success"} and "after" not in honest[1] and "after" not in honest[2]
     assert honest[0]["success"]["touch"]["pixels"]["mean"] < 0.75

@@ -268,10 +268,7 @@ def test_a_pipe_is_no_table(name: str, tmp_path: Path) -> None:
     [
         ({"from_timestamp": 0.0, "to_timestamp": 1.2, "file_index": 0}, r"\d and \d share frames of .*file-000\.mp4"),
         ({"from_timestamp": "soon"}, r"meta/episodes, observation\.images\.gelsight in episode 0, is damaged"),
-        (
-            {"from_timestamp": float("nan")},
-            r"meta/episodes, observation\.images\.gelsight in episode 0, begins at nan s",
-        ),
+        ({"from_timestamp": np.nan}, r"meta/episodes, observation\.images\.gelsight in episode 0, begins at nan s"),
         ({"file_index": None}, r"meta/episodes, observation\.images\.gelsight in episode 0, is damaged"),
     ],
 )
@@ -330,8 +327,7 @@ def make_hub(root: Path) -> Path:
     features = {"kind": {"names": ["wood", "metal"], "_type": "ClassLabel"}, "touch": {"_type": "Image"}}
     note = {b"huggingface": json.dumps({"info": {"features": features}}).encode()}
     root.mkdir(parents=True)
-    names = ("train-00000-of-00002", "train-00001-of-00002", "test-00000-of-00001")
-    for file, name in enumerate(names):
+    for file, name in enumerate(("train-00000-of-00002", "train-00001-of-00002", "test-00000-of-00001")):
         rows: list[dict[str, Any]] = []
         for i in range(10 * file, 10 * file + 10):
             image: dict[str, Any] = {"bytes": png(i), "path": f"{i}.png"}

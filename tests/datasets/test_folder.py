@@ -82,8 +82,7 @@ def rows(tmp_path: Path) -> Table:
 
 
 def config(path: Path, **options: Any) -> FolderConfig:
-    given: dict[str, Any] = {"labels": ("material",), "group": "object", "size": 16, "path": path}
-    return FolderConfig(**(given | options))
+    return FolderConfig(**{"labels": ("material",), "group": "object", "size": 16, "path": path, **options})
 
 
 def packed(options: FolderConfig, out: Path, *, workers: int = 1) -> Pack:
@@ -99,8 +98,7 @@ def test_every_image_stands_beside_its_own_row(tmp_path: Path, rows: Table, opti
         assert (pack.images["vision"][i] == colour(row, 0)).all()
         assert (pack.images["touch"][i] == (*colour(row, 1), *colour(row, 2))).all()  # left first, then right
         assert pack.column("object")[i] == rows[row]["object"] == pack.column("group")[i]
-        label = pack.column("label_material")[i]
-        assert (("metal", "wood", "")[label]) == rows[row]["material"]
+        assert ("metal", "wood", "")[pack.column("label_material")[i]] == rows[row]["material"]
 
 
 def test_csv_parquet_and_jsonl_give_one_pack(tmp_path: Path) -> None:

@@ -71,9 +71,8 @@ def test_probes_see_only_what_is_there(holes: Pack, trained: Path, monkeypatch: 
     result = probe_runs([trained], ProbeConfig(tasks=("pattern",)), holes)
     for modality, rows in asked.items():
         assert rows and holes.has(modality)[sorted(rows)].all()
-    task = holes.spec.tasks[0]
     num = {r["modality"]: r["num_test"] for r in result["records"] if r["source"] == "mvitac"}
-    assert num == {m: len(split_rows(holes, task, m).test) for m in ("vision", "touch", "both")}
+    assert num == {m: len(split_rows(holes, holes.spec.tasks[0], m).test) for m in ("vision", "touch", "both")}
     assert num["both"] < min(num["vision"], num["touch"])
 
 

@@ -109,8 +109,7 @@ def test_frames_that_only_the_rough_lists_name_are_hidden_from_all_else() -> Non
     assert len(test) == 29_879 and set(named[test]) == {"test"}
     assert not set(touch[test]) & set(touch[pack.rows("train")])
     assert pack.hidden.sum() == 20_735 and (pack.column("split_rough")[pack.hidden] == "train").sum() == 16_892
-    rough = next(task for task in pack.spec.tasks if task.name == "rough")
-    rows = split_rows(pack, rough)
+    rows = split_rows(pack, next(task for task in pack.spec.tasks if task.name == "rough"))
     assert (len(rows.fitted), len(rows.test)) == (35_119, 8_085)
     assert set(SupervisedConfig(tasks=("rough",)).training_rows(pack)) == set(rows.fitted)
     assert len(MViTacConfig().training_rows(pack)) == 91_982

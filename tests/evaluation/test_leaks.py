@@ -27,22 +27,9 @@ from mvitac.data.windows import windowed
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.pack import ON_VAL, PackConfig
 from mvitac.deploy.publish import publish
+from mvitac.evaluation import leaks
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs, stored_result
-from mvitac.evaluation.leaks import (
-    CHOSE,
-    DECLARED,
-    FILE,
-    NOT_SEEN,
-    UNKNOWN,
-    Scored,
-    file_source,
-    leak_mark,
-    leaks_of,
-    read_sources,
-    source_of,
-    weights_files,
-    write_sources,
-)
+from mvitac.evaluation.leaks import FILE, UNKNOWN, Scored, read_sources, source_of, write_sources
 from mvitac.evaluation.score_text import with_interval
 from mvitac.evaluation.scores import pool, summarise
 from mvitac.nn.encoders import build_trunk
@@ -113,8 +100,7 @@ def test_a_forgotten_group_is_told_below_scores(pack: Pack, tmp_path: Path, caps
     assert main(["data", "check", str(tmp_path / "forgotten"), "--json", str(tmp_path / "c.json")]) == 1
     found = [f for f in read_json(tmp_path / "c.json", "findings")["findings"] if f["item"] == "groups"]
     assert found[0]["verdict"] == "look" and warning in found[0]["evidence"] and "cup 9 of 9" in found[0]["evidence"]
-    forgotten = Pack(tmp_path / "forgotten")
-    mvitac.train(smoke(forgotten, steps=1, eval_every=0), tmp_path / "run", quiet=True)
+    mvitac.train(smoke(Pack(tmp_path / "forgotten"), steps=1, eval_every=0), tmp_path / "run", quiet=True)
     capsys.readouterr()
     assert main(["probe", str(tmp_path / "run"), "--modalities", "touch"]) == 0
     assert f"note: {warning}" in " ".join(capsys.readouterr().out.split())
@@ -125,7 +111,7 @@ def test_a_forgotten_group_is_told_below_scores(pack: Pack, tmp_path: Path, caps
 def test_a_split_that_leaks_marks_every_score(run: Path, pack: Pack) -> None:
     own = with_columns(pack, split=np.where(np.arange(pack.num) % 2 == 0, "test", "train"))
     result = probe_runs([run], ProbeConfig(tasks=("pattern",), modalities=("touch",)), own, allow_leak=True)
-    assert {leak_mark(record["leak"]) for record in (*result["records"], *result["retrieval"])} == {" LEAK"}
+    assert {leaks.leak_mark(record["leak"]) for record in (*result["records"], *result["retrieval"])} == {" LEAK"}
     assert "60 of 60 test instances are also in train: this split leaks" in result["leaks"]
 
 
@@ -154,7 +140,7 @@ def test_every_source_of_a_run_counts(pack: Pack, tmp_path: Path) -> None:
     assert read and [source.name for source in read] == ["toy", "before"]
     leak = Scored(pack).leak(read, pack.rows("test"))
     assert leak.endswith("were trained on (before)") and "(toy)" not in leak
-    assert leaks_of([{"source": "a", "task": "t", "leak": leak}] * 2) == [f"a, t: {leak}", NOT_SEEN]
+    assert leaks.leaks_of([{"source": "a", "task": "t", "leak": leak}] * 2) == [f"a, t: {leak}", leaks.NOT_SEEN]
 
 
 def test_a_list_is_that_of_its_run_and_of_its_weights(pack: Pack, tmp_path: Path) -> None:
@@ -162,10 +148,10 @@ def test_a_list_is_that_of_its_run_and_of_its_weights(pack: Pack, tmp_path: Path
     train(replace(smoke(pack), steps=1), tmp_path, quiet=True)
     assert Scored(pack).leak(read_sources(tmp_path), val) == ""
     leak = f"{len(val)} of {len(val)} test rows and "
-    assert (found := Scored(pack).leak(read_sources(tmp_path, "best"), val)).startswith(leak) and CHOSE in found
+    assert (found := Scored(pack).leak(read_sources(tmp_path, "best"), val)).startswith(leak) and leaks.CHOSE in found
     start = Init(path=tmp_path / "model.best.safetensors")
     heir = train(replace(smoke(pack), steps=1, init=start), tmp_path / "heir", quiet=True)
-    assert CHOSE in Scored(pack).leak(read_sources(heir), val)
+    assert leaks.CHOSE in Scored(pack).leak(read_sources(heir), val)
     write_sources(tmp_path, [source_of(pack, pack.rows("test"))])  # of a run that saw other rows
     with pytest.raises(ValueError, match="is of another run"):
         read_sources(tmp_path)
@@ -177,9 +163,8 @@ def test_a_list_is_that_of_its_run_and_of_its_weights(pack: Pack, tmp_path: Path
 
 def test_numbers_mean_nothing_outside_their_dataset(pack: Pack) -> None:
     """Ids of the striped pairs are numbers; those of its groups are names."""
-    elsewhere = with_columns(pack, spec=replace(pack.spec, name="other"))
     nameless = replace(source_of(pack, pack.rows("train")), images=np.zeros(0, np.uint64))
-    leak = Scored(elsewhere).leak([nameless], pack.rows("train"))
+    leak = Scored(with_columns(pack, spec=replace(pack.spec, name="other"))).leak([nameless], pack.rows("train"))
     assert leak.startswith(f"0 of {len(pack.rows('train'))} test rows and ")
     again = with_columns(pack, spec=replace(pack.spec, name="toy (another split)"))
     assert Scored(again).leak([source_of(pack, pack.rows("train"))], pack.rows("train")).startswith("72 of 72 test")
@@ -320,15 +305,15 @@ def test_start_weights_of_which_their_owner_says_it(
     unknown = f"mvitac: warning: nothing says what {file} was trained on: leaks of test rows cannot be excluded"
     assert told.startswith(unknown) == (leak == UNKNOWN) and (leak in told or leak == UNKNOWN)
     own, theirs = read_sources(tmp_path / "run") or []
-    assert own.name == "toy" and theirs.name == (f"{DECLARED}{text}" if text else "theirs.safetensors")
+    assert own.name == "toy" and theirs.name == (f"{leaks.DECLARED}{text}" if text else "theirs.safetensors")
     assert Scored(pack).leak([theirs], pack.rows("test")) == leak
-    assert [file_source(file).name for file in weights_files(run)] == [theirs.name] and not weights_files(smoke(pack))
-    encoder = open_model(f"external:timm/{run.encoder.touch.trunk},weights={file},size=32")
-    assert encoder.trained_on == (text or UNKNOWN)
+    assert [leaks.file_source(file).name for file in leaks.weights_files(run)] == [theirs.name]
+    assert not leaks.weights_files(smoke(pack))
+    assert open_model(f"external:timm/{run.encoder.touch.trunk},weights={file},size=32").trained_on == (text or UNKNOWN)
 
 
 def test_other_names_of_the_data_count_too(pack: Pack, tmp_path: Path) -> None:
-    source = file_source(weights(pack, tmp_path, "Touch and Go"))
+    source = leaks.file_source(weights(pack, tmp_path, "Touch and Go"))
     scored, rows = Scored(pack), pack.rows("test")
     assert scored.leak([source], rows) == "" and "TAG, Touch-and-Go" not in scored.leak([source], rows)
     assert scored.leak([source], rows, ["TAG", "touch-and-go"]).startswith("touch-and-go was in its owner's training")

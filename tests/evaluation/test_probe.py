@@ -217,8 +217,7 @@ def test_a_model_of_both_senses_is_probed_on_one(tmp_path: Path) -> None:
     touch = toy_pack(tmp_path / "touch", vision_channels=0)
     model = fresh(smoke(touch), Toy().spec(), touch.size)
     assert cross_modal(model, touch) == []
-    found = probe_model(model, touch, touch.spec.tasks[:1], ["touch"], ["knn"])
-    assert [r["modality"] for r in found] == ["touch"]
+    assert [r["modality"] for r in probe_model(model, touch, touch.spec.tasks[:1], ["touch"], ["knn"])] == ["touch"]
 
 
 def test_a_runs_own_classifier_answers_by_the_names_of_classes(pack: Pack) -> None:
@@ -226,8 +225,7 @@ def test_a_runs_own_classifier_answers_by_the_names_of_classes(pack: Pack) -> No
 
     def own(*classes: str) -> list[dict]:
         other = renumbered(pack, *classes)
-        found = probe_model(model, other, other.spec.tasks[:1], ["both"], ["knn"])
-        return [r for r in found if r["probe"] == "own"]
+        return [r for r in probe_model(model, other, other.spec.tasks[:1], ["both"], ["knn"]) if r["probe"] == "own"]
 
     names = pack.spec.tasks[0].classes
     assert own("checks", "columns", "rows")[0]["group_correct"] == own(*names)[0]["group_correct"]

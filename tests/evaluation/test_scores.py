@@ -219,8 +219,7 @@ def test_a_feature_that_is_hardly_there_in_the_fitted_rows_does_not_decide_the_l
     x[:, 7], new[:, 7] = 0.0, 0.0
     x[3, 7], new[5, 7] = 1e-4, 0.2
     y = x[:, :1] + 0.3 * torch.randn(200, 1, generator=rng)
-    error = d.linear_probe(x, y, torch.arange(200) // 4, new) - new[:, :1]
-    assert float(error.abs().max()) < 1
+    assert float((d.linear_probe(x, y, torch.arange(200) // 4, new) - new[:, :1]).abs().max()) < 1
 
 
 def test_an_r2_far_below_0_weighs_no_more_than_a_few_accuracies() -> None:

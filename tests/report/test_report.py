@@ -243,10 +243,9 @@ def texts_of(records: Sequence[dict[str, Any]]) -> dict[tuple[str, ...], str]:
 def test_report_and_comparison_give_one_text_for_one_score(materials: Path, result: dict[str, Any]) -> None:
     whole, html = compared(result), (materials / "out" / "report.html").read_text()
     page, drawn, lines = Page(html).text, "".join(drawings(html)), lines_of(whole)
-    tex = latex(whole, lines)
+    shown = page.replace("\xa0", " "), markdown(whole, lines), latex(whole, lines)
     for cell, text in texts_of(result["records"]).items():
-        for shown in (page.replace("\xa0", " "), markdown(whole, lines), tex):
-            assert text in shown, cell
+        assert all(text in each for each in shown), cell
         assert re.search(rf"[> ]{re.escape(text.split()[0])}<", drawn), cell  # beside a bar or a line
 
 
@@ -257,8 +256,7 @@ def test_probe_and_card_give_one_text(materials: Path, tmp_path: Path, capsys: p
     assert main(["publish", str(run), str(card)]) == 0
     shown = (printed, capsys.readouterr().out, (card / "README.md").read_text())
     (run / "probe.json").unlink()
-    again = (publish(run, tmp_path / "again") / "README.md").read_text()  # with controls of its own
-    assert again == shown[2]
+    assert (publish(run, tmp_path / "again") / "README.md").read_text() == shown[2]  # with controls of its own
     for cell, text in texts_of(json.loads((tmp_path / "probe.json").read_text())["records"]).items():
         assert all(text in each for each in shown), cell
 
@@ -295,10 +293,9 @@ def test_only_a_complete_result_of_the_same_weights_is_used_again(
 
 
 def test_scores_of_other_runs_or_data_are_refused(materials: Path, result: dict[str, Any], tmp_path: Path) -> None:
-    pack = Pack(materials / "pack")
     with pytest.raises(ValueError, match="other data"):
         write_report([materials / "run0"], tmp_path, result={**result, "pack": "other"}, quiet=True)
-    other = train(smoke(pack, seed=7), tmp_path / "other", quiet=True)
+    other = train(smoke(Pack(materials / "pack"), seed=7), tmp_path / "other", quiet=True)
     with pytest.raises(ValueError, match=r"differ in .*other"):
         write_report([other], tmp_path, result=result, quiet=True)
     with pytest.raises(ValueError, match=r"differ in .*run1"):

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
@@ -154,8 +153,7 @@ def test_figures_cut_off_what_no_axis_can_show() -> None:
 
 
 def test_predictions_that_are_exact_lie_on_the_line() -> None:
-    drawn: Figure = figures.predicted("force", [[0, 0], [2, 2], [4, 1000]], "N", "blue")
-    (axes,) = drawn.axes
+    (axes,) = figures.predicted("force", [[0, 0], [2, 2], [4, 1000]], "N", "blue").axes
     (line,) = axes.lines
     assert list(line.get_xdata()) == list(line.get_ydata()) and axes.get_xlim() == axes.get_ylim()
     at = axes.collections[0].get_offsets()

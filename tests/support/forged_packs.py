@@ -13,7 +13,6 @@ Change = Callable[[Any], object]
 
 
 def put(*keys: str | int, value: Any) -> Change:
-
     def change(inner: Any) -> None:
         for key in keys[:-1]:
             inner = inner[key]
@@ -38,7 +37,6 @@ def seal(path: Path) -> None:
 
 
 def described(*keys: str, value: Any) -> Spoil:
-
     def spoil(path: Path) -> None:
         edited(path / "pack.json", keys, value)
         seal(path)

@@ -31,13 +31,11 @@ def build(name: str, spec: DataSpec | None = None, config: MethodConfig | None =
 
 
 def views(method: Method, num: int = 8, seed: int = 5, vision: int = 3, touch: int = 3) -> Views:
-    generator = torch.Generator().manual_seed(seed)
+    rng = torch.Generator().manual_seed(seed)
     channels = {m: c for m, c in (("vision", vision), ("touch", touch)) if c}
-    images = {
-        m: [torch.randn(num, c, 32, 32, generator=generator) for _ in range(method.views)] for m, c in channels.items()
-    }
+    images = {m: [torch.randn(num, c, 32, 32, generator=rng) for _ in range(method.views)] for m, c in channels.items()}
     labels = {"pattern": torch.arange(num) % 3, "bright": torch.arange(num) % 2}
-    return Views(images=images, labels=labels, rows=ROWS[torch.randperm(len(ROWS), generator=generator)[:num]])
+    return Views(images=images, labels=labels, rows=ROWS[torch.randperm(len(ROWS), generator=rng)[:num]])
 
 
 def outcome(method: Method, batch: Views) -> dict[str, torch.Tensor]:

@@ -72,8 +72,7 @@ class Toy(Source):
             y, x = np.mgrid[0:32, 0:32]
             columns, rows = np.sin(0.8 * x + instance), np.sin(0.8 * y + instance)
             wave = (columns, rows, columns * rows)[category] * 60 + 90 + 60 * bright
-            noisy = wave[:, :, None] + rng.normal(0, 8, (32, 32, channels))
-            return np.clip(noisy, 0, 255).astype(np.uint8)
+            return np.clip(wave[:, :, None] + rng.normal(0, 8, (32, 32, channels)), 0, 255).astype(np.uint8)
 
         columns = {
             "id": f"{item:04d}",
@@ -154,8 +153,7 @@ class Holes(Toy):
         (sample,) = super().read(item)
         has = {"vision": item % 7 != 3, "touch": item % 5 != 1}
         columns = {**sample.columns, **{f"has_{m}": present for m, present in has.items()}}
-        images = {m: getattr(sample, m) if has[m] else None for m in has}
-        return [Sample(columns=columns, **images)]
+        return [Sample(columns=columns, **{m: getattr(sample, m) if has[m] else None for m in has})]
 
 
 def film(pack: Pack, folder: Path, *, rest: int, num: int, fps: int) -> list[str]:

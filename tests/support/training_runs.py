@@ -32,9 +32,7 @@ def smoke(pack: Pack, **changes: object) -> Run:
 @contextmanager
 def power_cut(after: int) -> Iterator[None]:
     """Training dies (RuntimeError "power cut") when it asks for its views after ``after`` batches."""
-    left = iter(range(after))
-
-    make = StepViews.make
+    left, make = iter(range(after)), StepViews.make
 
     def dying(self: StepViews, rows: np.ndarray, seed: int) -> Views:
         if next(left, None) is None:

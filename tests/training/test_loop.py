@@ -301,9 +301,8 @@ def twice(tmp_path_factory: pytest.TempPathFactory) -> Pack:
 def test_the_other_sensors_view_is_of_the_same_press(twice: Pack, pack: Pack) -> None:
     rows = twice.rows("train")
     run = replace(recipe("smoke", PackConfig(path=twice.path)), augment=Augment(size=16))
-    one_more = replace(run, method=MViTacConfig(hidden=32, out=16, lambda_sensor=0.5))
     assert asked(run, twice, rows)[0] == [2, 2]
-    num, views = asked(one_more, twice, rows)
+    num, views = asked(replace(run, method=MViTacConfig(hidden=32, out=16, lambda_sensor=0.5)), twice, rows)
     found = views["touch"][-1]
     assert num == [2, 3] and np.array_equal(twice.presses[found], twice.presses[rows])
     assert (twice.sensors[found] != twice.sensors[rows]).all()

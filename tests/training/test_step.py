@@ -41,9 +41,8 @@ def test_the_step_is_the_plain_one_written_out() -> None:
     take(run, fast, [lambda: batch], num=3)
     optimiser = torch.optim.Adam([p for p in plain.parameters() if p.requires_grad], 1e-3, eps=1e-7, foreach=False)
     for _ in range(3):
-        loss = plain(batch)["loss"]
         optimiser.zero_grad()
-        loss.backward()
+        plain(batch)["loss"].backward()
         optimiser.step()
         for name, key in plain.key.state_dict().items():
             query = plain.query.state_dict()[name.replace(".module.", ".")]

@@ -176,8 +176,7 @@ def test_a_table_shows_each_evaluation(measured: Pack, tmp_path: Path, capsys: p
 
 def test_many_tasks_fit_a_line() -> None:
     names = [f"vision/linear a_long_name_{i}" for i in range(20)]
-    columns = log.shown_scores(dict.fromkeys([*names, "b touch->vision R@5"], 0.5))
-    widths = log._widths(list(columns))
+    widths = log._widths(list(log.shown_scores(dict.fromkeys([*names, "b touch->vision R@5"], 0.5))))
     assert list(widths)[-1] == log.RETRIEVED and len(widths) == 8
     assert len(log._line(["1", "2", "3"], list(widths), "+100.0", widths)) <= log.WIDTH
 

@@ -20,9 +20,8 @@ def generator(seed: int = 0) -> torch.Generator:
 
 
 def denormalise(view: torch.Tensor) -> torch.Tensor:
-    sensors = view.unflatten(1, (-1, 3))
     mean, std = (torch.tensor(v).view(3, 1, 1) for v in IMAGENET)
-    return (sensors * std + mean).flatten(1, 2)
+    return (view.unflatten(1, (-1, 3)) * std + mean).flatten(1, 2)
 
 
 @pytest.mark.parametrize("size", [24, 40, 56])
