@@ -12,16 +12,7 @@ import pytest
 from PIL import Image
 
 from mvitac.cli.main import main
-from mvitac.control.ablate import (
-    Episodes,
-    Recorded,
-    ablate,
-    act,
-    open_policy,
-    read_episodes,
-    suite_episodes,
-    suite_policy,
-)
+from mvitac.control.ablate import Recorded, ablate, act, open_policy, read_episodes, suite_episodes, suite_policy
 from mvitac.control.result import find_suite
 from mvitac.control.video import film, webp
 from mvitac.data.build import build
@@ -160,9 +151,9 @@ class Way:
 
 def test_episodes_may_end_when_the_policy_is_done() -> None:
     """Two and four steps in turn, or with the gel of the next episode four and two: changes of +2 and -2."""
-    paces = [1, 2, 1, 2, 1, 2]
-    episodes = Episodes(begin=[partial(Way, pace) for pace in paces], senses=("touch",), unit="steps")
-    found = ablate(lambda o: [o["touch"].mean()], episodes)
+    made = suite_episodes(replace(find_suite("insert-v1"), episodes=3), ("touch", "30"))
+    own = replace(made, begin=[partial(Way, pace) for pace in [1, 2] * 3], senses=("touch",), unit="steps")
+    found = ablate(lambda o: [o["touch"].mean()], own)
     rows = {row["kind"]: row for row in found["rows"]}
     assert found["error"][0] == 3 and rows["another episode"]["error"][0] == 0 == rows["10 frames ago"]["error"][0]
     assert rows["mean frame"]["error"][0] == 1  # four steps in each episode
