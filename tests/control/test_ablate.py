@@ -157,6 +157,11 @@ def test_episodes_may_end_when_the_policy_is_done() -> None:
     rows = {row["kind"]: row for row in found["rows"]}
     assert found["error"][0] == 3 and rows["another episode"]["error"][0] == 0 == rows["10 frames ago"]["error"][0]
     assert rows["mean frame"]["error"][0] == 1  # four steps in each episode
+    for loss, says in ((0.0, "episode 2 has no step"), (np.nan, "episode 2 has a loss of nan")):
+        odd = Way(1)
+        odd.loss, odd.mm = loss, 0.0 if loss else 4.0
+        with pytest.raises(ValueError, match=says):
+            ablate(lambda o: [1.0], replace(own, begin=[partial(Way, 1), lambda odd=odd: odd]))
 
 
 def test_numbers_that_would_be_wrong(pack: Pack) -> None:

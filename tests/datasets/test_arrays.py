@@ -253,6 +253,11 @@ def test_a_replay_buffer_in_zarr(tmp_path: Path, kind: str) -> None:
         gel: Any = zarr.open_group(str(path), mode="r+")["data/gel"]
         gel[3] = 7
         assert config.source().stamps() != before
+        whole = (chunk := path / "data/force/0").read_bytes()
+        chunk.write_bytes(whole[:-1])  # numcodecs would read on behind it
+        with pytest.raises(ValueError, match="data/force/0 is cut off"):
+            config.source()
+        chunk.write_bytes(whole)
         root["meta/episode_ends"][3] = 19
         with pytest.raises(ValueError, match=r"meta/episode_ends does not rise to 20"):
             config.source()

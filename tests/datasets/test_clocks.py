@@ -68,6 +68,13 @@ def test_a_log_is_joined_by_time(tmp_path: Path, how: Any) -> None:
         frame = shade(int(pack.column("frame")[i]), int(pack.column("recording")[i]))
         assert abs(pack.images["touch"][i].mean() - frame) < 6
     assert "force.csv joined by stamp, its largest gap is 0.01 s" in pack.spec.notes
+    for log in tmp_path.glob("set/*/force.csv"):  # a second sensor writes into it, in rows of its own
+        head, *lines = log.read_text().split()
+        both = [(f"{line},", f"{float(line.split(',')[0]) + 0.005},,,25") for line in lines]
+        log.write_text("\n".join([f"{head},T", *(line for pair in both for line in pair)]))
+    two = packed(tmp_path / "set", tmp_path / "two", labels=("kind",), interpolate=how, **LOG)
+    assert (two.values(two.spec.values[0])[:, 0] == found).all()
+    assert (two.column("label_kind") == pack.column("label_kind")).all()
 
 
 def test_nothing_is_extrapolated_and_what_is_left_out_is_counted(tmp_path: Path) -> None:

@@ -354,6 +354,9 @@ def test_image_parquet_of_the_hub(tmp_path: Path) -> None:
         assert pack.column("group")[row] == f"t{i // 2}"
         assert pack.column("split")[row] == ("test" if i >= 20 else "train")
     assert len({level(image) for image in pack.images["touch"]}) == 30
+    file = (root / "train-00001-of-00002.parquet").rename(tmp_path / "elsewhere")
+    assert "1 of the 2 files train-* are here" in config.manifest().notes
+    file.rename(root / "train-00001-of-00002.parquet")
     for file in [*root.glob("*.parquet"), root / "13.png"]:  # as the Hub converts a dataset
         os.renames(file, root / ("eval" if file.stem[:4] == "test" else "training") / file.name.split("-", 1)[-1])
     assert sorted(packed(config, tmp_path / "again").column("split")) == ["test"] * 10 + ["train"] * 20

@@ -1,5 +1,6 @@
 """What is published is what is loaded; anything else in its place is refused before it can do harm."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -62,9 +63,10 @@ def test_the_card_names_what_encoders_and_what_probes_learned_from(artifact: Pat
 
 def test_the_part_of_images_is_that_of_the_data_of_the_probes(smoke_run: Path, pack: Pack, tmp_path: Path) -> None:
     """Their answers are for images that show as much."""
-    part = {"touch": "0:0:9:9"}
-    publish(smoke_run, tmp_path / "a", with_columns(pack, spec=replace(pack.spec, crop=part)), allow_leak=True)
-    assert mvitac.load(tmp_path / "a").spec.crop == part
+    part, run = {"touch": "0:0:9:9"}, shutil.copytree(smoke_run, tmp_path / "run")
+    (run / "trained_on.safetensors").chmod(0o600)  # which others can read in an artifact
+    publish(run, tmp_path / "a", with_columns(pack, spec=replace(pack.spec, crop=part)), allow_leak=True)
+    assert mvitac.load(tmp_path / "a").spec.crop == part and (tmp_path / "a/trained_on.safetensors").stat().st_mode & 4
     assert with_probes(load(smoke_run), with_columns(pack, spec=replace(pack.spec, crop=part))).spec.crop == part
     with pytest.raises(ValueError, match="has labelled rows of no task in train and test: leave --on out"):
         publish(smoke_run, tmp_path / "b", with_columns(pack, split=["train"] * pack.num), allow_leak=True)

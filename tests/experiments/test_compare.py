@@ -193,6 +193,7 @@ def test_methods_of_these_plans_see_equally_many_images(pack: Pack, name: str) -
         ('reference = "a"\nset = {device = "cpu"}\n[[rows]]\nlabel = "a"', "device: give --device instead"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\nset = {recipe = "paper"}', "recipe: give --recipe"),
         ('reference = "a"\nset = {data.score_on = "val"}\n[[rows]]\nlabel = "a"', "give --data.score-on"),
+        ('reference = ".."\n[[rows]]\nlabel = ".."', "a label of letters or digits"),
         (f'reference = "a"\n[[rows]]\nlabel = "{"é" * 100}"', "under 200 bytes, without \\*"),
         ('reference = "pixels"\n[[rows]]\nlabel = "pixels"', "row 'pixels' has the name of a control"),
     ],

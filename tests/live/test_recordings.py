@@ -95,7 +95,11 @@ def test_pictures_named_by_their_time_are_at_it(tmp_path: Path) -> None:
     stamped = recording(str(tmp_path))
     assert (stamped.times - 1_700_000_000).tolist() == [0.25, 0.5, 20]
     assert recording(f"{tmp_path}@5").times.tolist() == [0, 0.2, 0.4]
-    (tmp_path / "1.png").write_bytes(b"")
+    (tmp_path / "free.png").write_bytes(b"")
+    with pytest.raises(ValueError, match="image 'free' has no time in its name"):
+        recording(str(tmp_path))
+    for number in (1, 2, 3):
+        (tmp_path / f"{number}.png").write_bytes(b"")
     assert recording(str(tmp_path)).times[1] == 1 / 30
 
 

@@ -209,6 +209,8 @@ def act(
             actions.append(action)
             world.step(action)
             step += 1
+        if not step or not np.isfinite(world.loss):
+            raise ValueError(f"episode {number + 1} has {f'a loss of {world.loss}' if step else 'no step'}")
         losses += [world.loss] * step
         lengths.append(step)
     return np.stack(actions), np.array(losses), np.split(np.arange(len(losses)), np.cumsum(lengths)[:-1])

@@ -70,7 +70,7 @@ class MixedPack(_Several):
         notes = [f"{name}: images of {px} {how}" for name, px in other.items()]
         if found := _shared_by_parts(parts):
             if not allow_leak:
-                raise ValueError(f"{found}: pack them with splits that agree, leave a part out, or give allow_leak")
+                raise ValueError(f"{found}: pack them with equal splits, leave a part out, or give --data.allow-leak")
             notes.append(found)
         tasks = _mixed_tasks(parts)
         self.spec = _mixed_spec(parts, tasks, notes)

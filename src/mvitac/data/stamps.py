@@ -31,9 +31,14 @@ def in_order(names: Iterable[str]) -> list[str]:
 
 
 def stamped(names: Sequence[str]) -> np.ndarray | None:
-    """Return the times [N] in seconds of images named by stamps since 1970; None of other names, as of those that count."""
-    times = seconds(names, "names") if all(number_of(name) is not None for name in names) else np.zeros(1)
-    return times if times.min() > 1e9 else None
+    """Return the times [N] in seconds of images named by stamps since 1970; None of other names, as of those that count.
+
+    ValueError if most are stamps, but not all.
+    """
+    other = [name for name in names if (number_of(name) or 0) <= 1e9]
+    if other and 2 * len(other) < len(names):
+        raise ValueError(f"image {other[0]!r} has no time in its name, as the others have: take it away")
+    return None if other else seconds(names, "names")
 
 
 def seconds(cells: Iterable[str], where: object) -> np.ndarray:

@@ -172,7 +172,7 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
             write_atomic(partial / "probes.safetensors", lambda file: file.write(safetensors.torch.save(tensors)))
         write_json(partial / "run.json", record, sealed=True)
         if learned is not None:
-            shutil.copy(run / FILE, partial)
+            shutil.copyfile(run / FILE, partial / FILE)
         keys, infos = ("name", "licence", "source"), [r.info for r in model.probes.values()]
         about = {
             "preprocessing": preprocessing(model),

@@ -53,8 +53,8 @@ class Embeddings:
         self.file = file
         try:
             self.table: pa.Table = pq.read_table(file, page_checksum_verification=True)
-            about = json.loads((self.table.schema.metadata or {})[ABOUT])
-        except (pa.ArrowException, OSError, KeyError, ValueError) as error:
+            about = json.loads((self.table.schema.metadata or {}).get(ABOUT, b""))
+        except (pa.ArrowException, OSError, ValueError) as error:
             raise ValueError(f"{file} is no table of mvitac embed: {brief(error)}") from None
         with fields_of(file):
             self.shared, self.pack, self.pack_digest = about["shared"], Path(about["pack"]), about["pack_digest"]

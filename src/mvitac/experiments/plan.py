@@ -74,10 +74,12 @@ class Plan:
         given = {name for each in (self.set, *(row.set for row in self.rows)) for name, _ in dotted(each)}
         for name in [name for name in fixed if name in given]:
             raise ValueError(f"{name}: {fixed[name]}")
-        if not all(0 < len(slug(label).encode()) < 200 and "*" not in label for label in labels):  # a folder; a control
-            raise ValueError(
-                f"plan {self.name!r}: give each row a label of letters or digits, under 200 bytes, without *"
-            )
+        folders = [slug(label).encode() for label in labels]
+        if not all(folder.strip(b".") and len(folder) < 200 for folder in folders) or "*" in "".join(
+            labels
+        ):  # a control
+            how = "a label of letters or digits, under 200 bytes, without *"
+            raise ValueError(f"plan {self.name!r}: give each row {how}")
         if taken := sorted(set(labels) & set(CONTROLS)):
             raise ValueError(f"row {taken[0]!r} has the name of a control: give it another label")
         if len({slug(label) for label in labels}) < len(labels):

@@ -142,7 +142,8 @@ def fields_of(files: Path | str) -> Iterator[None]:
 
 
 CONTROL = re.compile(
-    r"\\u00(?:0[0-8bcef]|1.|7f|[89].)|\\u20(?:2[a-e]|6[6-9])|[\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
+    r"(?<!\\)(?:\\\\)*\\(?:[bf]|(?i:u00(?:0[0-8bcef]|1.|7f|[89].)|u20(?:2[a-e]|6[6-9])))"
+    r"|[\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
 )
 """What begins an escape sequence or turns text around, as itself or as JSON writes it: names may be a stranger's."""
 

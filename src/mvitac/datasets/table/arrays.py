@@ -37,6 +37,14 @@ OWN = ("id", "demo", "frame")  # columns that episodes give
 LeftOut = dict[str, str]  # name of what is no column -> why
 
 
+def _check_blosc(array: Path) -> None:
+    """Raise ValueError if a chunk is not as long as its header says: blosc would read on, in memory that is not its own."""
+    for chunk in (file for file in walk(array) if file.is_file() and not file.name.startswith(".")):
+        with chunk.open("rb") as file:
+            if int.from_bytes(file.read(16)[12:], "little") != chunk.stat().st_size:
+                raise ValueError(f"{chunk} is cut off: fetch it again")
+
+
 def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vectors: Collection[str]) -> Manifest:
     """Return the table of ``files``, which are ``path`` itself or in this folder.
 
@@ -52,6 +60,8 @@ def read_arrays(path: Path, files: Sequence[Path], images: Collection[str], vect
             if inner.is_symlink():
                 raise ValueError(f"{inner} is a link: copy what it shows into {file}")
             check_ordinary(inner)  # a pipe never ends
+            if inner.name == ".zarray" and b'"blosc"' in inner.read_bytes():
+                _check_blosc(inner.parent)
         with open_arrays(file) as opened:
             everything = _datasets(opened)
             demos = _demonstrations(file, everything, images)

@@ -179,7 +179,8 @@ def joined(
 ) -> tuple[list[Row], float]:
     """Return the cells of ``log``, whose rows are of ``stamps`` [N], at ``times`` [M], and its largest gap in seconds.
 
-    Cells are {} where there is no measurement within ``tolerance``. Columns of ``smooth`` are interpolated, others nearest.
+    Cells are {} where there is no measurement within ``tolerance``. Columns of ``smooth`` are interpolated, others nearest;
+    empty cells do not count.
     """
     order = np.argsort(stamps, kind="stable")
     stamps = stamps[order]
@@ -189,18 +190,27 @@ def joined(
         return [{} for _ in times], 0.0
     gaps = np.diff(stamps)[np.diff(np.searchsorted(np.sort(times), stamps)) > 0]  # of those between recordings none
     columns = {name: [log.rows[row][name] for row in order[at]] for name in log.rows[0]}
-    for name in columns.keys() & set(smooth):
-        known = np.array([_number(log, row, name) for row in order.tolist()])
-        after = np.clip(np.searchsorted(stamps, times), min(1, len(stamps) - 1), len(stamps) - 1)
-        ends = np.abs(stamps[[after - 1, after]] - times).max(0)
-        good &= ((ends <= tolerance + 1e-9) & (times >= stamps[0]) & (times <= stamps[-1])) | (away == 0)
-        columns[name] = [text_of(float(f"{value:.9g}")) for value in np.interp(times, stamps, known)]
+    for name in columns:
+        texts = np.array([log.rows[row][name] for row in order], object)
+        known = np.array([_number(log, row, name) if name in smooth else math.nan for row in order.tolist()])
+        own = stamps[filled := np.isfinite(known) if name in smooth else texts != ""]
+        if (filled.all() and name not in smooth) or not len(own):
+            continue
+        at, away = nearest(own, times)
+        near, cells = away <= tolerance + 1e-9, texts[filled][at].tolist()
+        if name in smooth:
+            after = np.clip(np.searchsorted(own, times), min(1, len(own) - 1), len(own) - 1)
+            ends = np.abs(own[[after - 1, after]] - times).max(0)
+            near &= ((ends <= tolerance + 1e-9) & (times >= own[0]) & (times <= own[-1])) | (away == 0)
+            cells = [text_of(float(f"{value:.9g}")) for value in np.interp(times, own, known[filled])]
+        good &= near | ~filled.all()
+        columns[name] = [cell if here else "" for cell, here in zip(cells, near, strict=True)]
     step = np.median(np.diff(stamps, append=stamps[-1]))
     if columns.keys() & set(smooth) and good.mean() < 0.5 and step > 2 * tolerance:
         far = f"{log.path}: stamps are {step:g} s apart"
         raise ValueError(f"{far}, more than --data.tolerance {tolerance:g} on both sides: are they seconds?")
-    cells = [{name: texts[i] for name, texts in columns.items()} if good[i] else {} for i in range(len(times))]
-    return cells, float(gaps.max(initial=0.0))
+    rows = [{name: texts[i] for name, texts in columns.items()} if good[i] else {} for i in range(len(times))]
+    return rows, float(gaps.max(initial=0.0))
 
 
 def _number(log: Manifest, i: int, name: str) -> float:

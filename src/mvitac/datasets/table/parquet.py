@@ -6,6 +6,8 @@ of which an element is named. In a folder, the text before the first - of a file
     data/train-00000-of-00002.parquet   data/test-00000-of-00001.parquet   validation/0000.parquet
 """
 
+import re
+from collections import Counter
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
@@ -34,7 +36,9 @@ def read_parquet(path: Path, files: Sequence[Path], vectors: Collection[str]) ->
         for column in found:
             if len(found[column]) < len(rows):
                 raise ValueError(f"{path}: image column {column!r} is not in every file")
-    return Manifest.of(path, rows, found) if found else None
+    parts = Counter((f.parent, m[1], m[2]) for f in files if (m := re.fullmatch(r"(.*)-\d+-of-(\d+)", f.stem)))
+    lost = (f"{num} of the {of} files {stem}-* are here" for (_, stem, of), num in parts.items() if num < int(of))
+    return Manifest.of(path, rows, found, notes=tuple(lost)) if found else None
 
 
 def add_file(
