@@ -36,8 +36,8 @@ def read_parquet(path: Path, files: Sequence[Path], vectors: Collection[str]) ->
         for column in found:
             if len(found[column]) < len(rows):
                 raise ValueError(f"{path}: image column {column!r} is not in every file")
-    parts = Counter((f.parent, m[1], m[2]) for f in files if (m := re.fullmatch(r"(.*)-\d+-of-(\d+)", f.stem)))
-    lost = (f"{num} of the {of} files {stem}-* are here" for (_, stem, of), num in parts.items() if num < int(of))
+    parts = Counter((f.parent, m[1], int(m[2])) for f in files if (m := re.fullmatch(r"(.*)-\d+-of-(\d+)", f.stem)))
+    lost = (f"{num} of the {of} files {stem}-* are here" for (_, stem, of), num in parts.items() if num < of)
     return Manifest.of(path, rows, found, notes=tuple(lost)) if found else None
 
 
