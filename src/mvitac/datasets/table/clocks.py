@@ -191,14 +191,14 @@ def joined(
     gaps = np.diff(stamps)[np.diff(np.searchsorted(np.sort(times), stamps)) > 0]  # of those between recordings none
     columns = {name: [log.rows[row][name] for row in order[at]] for name in log.rows[0]}
     for name in columns:
-        texts = np.array([log.rows[row][name] for row in order], object)
-        known = np.array([_number(log, row, name) if name in smooth else math.nan for row in order.tolist()])
-        own = stamps[filled := np.isfinite(known) if name in smooth else texts != ""]
-        if (filled.all() and name not in smooth) or not len(own):
+        linear, texts = name in smooth, np.array([log.rows[row][name] for row in order], object)
+        known = np.array([_number(log, row, name) for row in order.tolist()]) if linear else np.zeros(len(order))
+        own = stamps[filled := np.isfinite(known) & (texts != "")]
+        if (filled.all() and not linear) or not len(own):
             continue
         at, away = nearest(own, times)
         near, cells = away <= tolerance + 1e-9, texts[filled][at].tolist()
-        if name in smooth:
+        if linear:
             after = np.clip(np.searchsorted(own, times), min(1, len(own) - 1), len(own) - 1)
             ends = np.abs(own[[after - 1, after]] - times).max(0)
             near &= ((ends <= tolerance + 1e-9) & (times >= own[0]) & (times <= own[-1])) | (away == 0)
