@@ -129,9 +129,9 @@ class Live:
         # A newer frame may have come since ``leading`` was read: the one that is used counts.
         self._seen = (frames[self._leads][0] or leading).number
         now = self.clock()
-        # Every stream must have a frame that shows the present; an old one would give an answer about the past.
+        # Every stream must run and have a frame that shows the present; an old one would give an answer about the past.
         pairs = zip(self.all, (frame for found in frames.values() for frame in found), strict=True)
-        if not all(f and stream.fault != "frozen" and now - f.time <= stream.stale_after for stream, f in pairs):
+        if not all(f and not stream.fault and now - f.time <= stream.stale_after for stream, f in pairs):
             self.num_stale += 1
             self._lose()
             return False
