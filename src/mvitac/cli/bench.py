@@ -109,7 +109,6 @@ def check(argv: list[str]) -> None:
         with fields_of(path):
             found = problems(result := read_result(path))
         if found:
-            more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-            raise ValueError(f"{path}: {found[0]}{more}")
+            raise ValueError(f"{path}: {found[0]}" + f" (and {len(found) - 1} more)" * (len(found) > 1))
         num = sum(len(block.get("records", ())) for block in result["blocks"])
         print(f"{path}: {result['encoder']['name']} on {result['suite']['name']}, {num} scores are those of its sums")

@@ -81,8 +81,7 @@ def _sheet(what: str, options: _Options) -> Draw | None:
         return None
 
     def sheet(pack: Pack, findings: Sequence[Finding]) -> None:
-        blocks = [*suspicious(pack, findings), *samples(pack)]
-        write_atomic(out, lambda file: draw(what, blocks).save(file, format="PNG"))
+        write_atomic(out, lambda file: draw(what, [*suspicious(pack, findings), *samples(pack)]).save(file, "PNG"))
         print(f"written: {out}", file=printed_to(options.json))
 
     return sheet
@@ -93,7 +92,6 @@ def _report(what: str, findings: Sequence[Finding], options: _Options) -> int:
     width = max(40, shutil.get_terminal_size().columns - 40)
     rows = [[f.verdict, f.item, f.evidence + (f"\n-> {f.advice}" if f.advice else "")] for f in findings]
     table = tabulate(rows, ["", "item", "what was found"], disable_numparse=True, maxcolwidths=[None, 20, width])
-    say = printed_to(options.json)
-    print(f"{what}: {('ok', 'look', 'broken')[code]}", table, "", sep="\n", file=say)
+    print(f"{what}: {('ok', 'look', 'broken')[code]}", table, "", sep="\n", file=printed_to(options.json))
     save_json(options.json, {"what": what, "exit_code": code, "findings": [asdict(f) for f in findings]})
     return code

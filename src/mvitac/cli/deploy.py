@@ -99,5 +99,4 @@ def export(argv: list[str]) -> None:
     rows += [[f"{name}, lowest cosine", "", f"{values['min']:.5f}"] for name, values in report["cosine"].items()]
     latency = "{p50} / {p99}".format(**report["latency_ms"])
     rows += [["size, MB", "", f"{report['size_mb']}"], ["latency of one pair, ms: p50 / p99", "", latency]]
-    title = f"{options.out}: checked on {report['num_rows']} rows of {(new or pack).path}"
-    print(text_table(title, ["", *both], rows))
+    print(text_table(f"{options.out}: checked on {report['num_rows']} rows of {(new or pack).path}", ["", *both], rows))

@@ -45,8 +45,7 @@ def finetune(argv: list[str]) -> None:
     given = options.model, options.data, options.config, options.out
     result = run_finetune(*given, resume=options.resume, quiet=options.quiet)
     print_finetuning(result)
-    print(f"scores: {options.out / 'scores.json'}")
-    print(next_step(result, options.config.fractions[-1]))
+    print(f"scores: {options.out / 'scores.json'}", next_step(result, options.config.fractions[-1]), sep="\n")
 
 
 def next_step(result: dict[str, Any], fraction: float) -> str:

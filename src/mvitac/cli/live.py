@@ -100,8 +100,7 @@ def live(argv: list[str]) -> None:
     _say_uncropped(engine, wanted)
     streams: Any = {}
     for m, texts in wanted.items():  # not yet open; several of one modality are numbered from 1
-        names = [m] if len(texts) == 1 else [f"{m} {i}" for i in range(1, len(texts) + 1)]
-        named = zip(names, texts, strict=True)
+        named = ((f"{m} {i}" if len(texts) > 1 else m, text) for i, text in enumerate(texts, 1))
         streams[m] = [Stream(name, source(text, m), stale_after=options.stale) for name, text in named]
     if not (options.vision or options.touch):
         _say("no --vision, no --touch: all sensors are simulated")

@@ -17,14 +17,11 @@ from mvitac.system.files import fields_of
 def card(model: Model, about: dict[str, Any]) -> str:
     """The model card: Markdown with the Hub's front matter. ``about`` is what artifact.json says."""
     data, learned, scores = about["data"], about["trained_on"], about["scores"]
-    sets = {"Encoders and probes": learned}
-    if learned != {key: data[key] for key in learned}:
-        sets = {"Encoders": learned, "Probes": data}
+    same = learned == {key: data[key] for key in learned}
+    sets = {"Encoders and probes": learned} if same else {"Encoders": learned, "Probes": data}
     licences = ", and ".join(dict.fromkeys(one["licence"] for one in sets.values()))
-    loader = jinja2.PackageLoader("mvitac", "deploy")
-    pages = jinja2.Environment(
-        loader=loader, finalize=_harmless, undefined=jinja2.StrictUndefined, keep_trailing_newline=True
-    )
+    pages = jinja2.Environment(finalize=_harmless, undefined=jinja2.StrictUndefined, keep_trailing_newline=True)
+    pages.loader = jinja2.PackageLoader("mvitac", "deploy")
     with fields_of("run.json"):
         text = pages.get_template("card.md.j2").render(
             about,

@@ -139,8 +139,7 @@ def quantise(path: Path, inputs: list[str], examples: list[list[np.ndarray]]) ->
 
 
 def output_of(probe: LinearProbe) -> str:
-    kind = "probability" if isinstance(probe.info, ProbeInfo) else "value"
-    return f"{kind}_{probe.info.task}"
+    return f"{'probability' if isinstance(probe.info, ProbeInfo) else 'value'}_{probe.info.task}"
 
 
 def _filter(size: int, stored: int) -> Tensor:

@@ -84,9 +84,8 @@ class ObservationEncoder(nn.Module):
             for name in names:
                 image = observation[name]
                 if image.ndim < 4 or image.shape[:-3] != lead:
-                    how = (
-                        f"does not fit images of {list(first.shape)}" if first.ndim > 3 else "has no axis for the batch"
-                    )
+                    others = f"does not fit images of {list(first.shape)}"
+                    how = others if first.ndim > 3 else "has no axis for the batch"
                     raise ValueError(f"{name}: {list(image.shape)} {how}")
                 check = image.is_cpu or name not in self._checked  # on a GPU, the values of the first only
                 images = check_images(image.flatten(0, -4), 3, name, values=check)

@@ -165,8 +165,7 @@ class Live:
         if self.contact and not before:
             self.num_touches += 1
         if bool(self.contact) != bool(before) or not self._since:
-            pairs = (pair for m in frames for pair in zip(self.streams[m], frames[m], strict=True))
-            self._since = {stream.name: frame.time for stream, frame in pairs}
+            self._since = {s.name: f.time for m in frames for s, f in zip(self.streams[m], frames[m], strict=True)}
         if not (self.contact or (self.always and (self.contact is False or not self.minus_rest))):
             return images, None
         given = {m: self._as_trained(m, self._window(m, frames[m], image)) for m, image in images.items()}

@@ -271,8 +271,7 @@ class Head(nn.Sequential):
 
     def __init__(self, features: int, hidden: int, out: int, *, dropout: float = 0.0, norm: bool = False) -> None:
         norms, drops = [nn.BatchNorm1d(hidden)] * norm, [nn.Dropout(dropout)] * bool(dropout)
-        first = nn.Linear(features, hidden, bias=not norm)
-        super().__init__(first, *norms, nn.ReLU(), *drops, nn.Linear(hidden, out))
+        super().__init__(nn.Linear(features, hidden, bias=not norm), *norms, nn.ReLU(), *drops, nn.Linear(hidden, out))
 
 
 class Projected(nn.Module):

@@ -91,8 +91,7 @@ def use_convolutions(trunk: nn.Module) -> nn.Module:
 
 def _ours(conv: nn.Conv2d) -> type[nn.Module]:
     kind, side, same = type(conv), conv.kernel_size[0], type(conv) is Conv2dSame
-    padding = (0, 0) if same else (side // 2, side // 2)
-    shape = ((side, side), padding, (1, 1), "zeros", None, (conv.stride[0],) * 2)
+    shape = ((side, side), (0 if same else side // 2,) * 2, (1, 1), "zeros", None, (conv.stride[0],) * 2)
     given = (conv.kernel_size, conv.padding, conv.dilation, conv.padding_mode, conv.bias, conv.stride)
     if kind not in (nn.Conv2d, Conv2dSame) or given != shape:
         return kind

@@ -40,8 +40,7 @@ def write_model(path: Path, tensors: State, about: dict[str, str]) -> None:
     """Write the weights of a model, with the texts ``about`` it and digests of both in the header."""
     header = {"format": FORMAT, **about, "digest": safetensors_digest(tensors)}
     header["header_digest"] = digest([*about.values()])
-    data = safetensors.torch.save(tensors, metadata=header)
-    write_atomic(path, lambda file: file.write(data))
+    write_atomic(path, lambda file: file.write(safetensors.torch.save(tensors, metadata=header)))
 
 
 def read_model(file: Path, about: tuple[str, ...]) -> tuple[dict[str, str], State]:
@@ -229,5 +228,4 @@ def misfit(expected: State, found: dict[str, Any]) -> str:
 
 
 def _some(names: Collection[str]) -> str:
-    first = ", ".join([*names][:3]) + ", ..." * (len(names) > 3)
-    return f"{len(names)} tensor{'s' * (len(names) > 1)} ({first})"
+    return f"{len(names)} tensor{'s' * (len(names) > 1)} ({', '.join([*names][:3])}{', ...' * (len(names) > 3)})"
