@@ -128,10 +128,8 @@ def _scene(peg: Peg, slot_mm: float) -> str:
     beside, behind = gap + 0.015, 0.0135
     boxes = [(slot - beside, 0, 0.015, 0.018), (slot + beside, 0, 0.015, 0.018)]
     boxes += [(slot, -behind, gap, 0.0045), (slot, behind, gap, 0.0045)]
-    walls = "".join(
-        f'<geom name="block{i}" type="box" size="{w} {d} .01" pos="{x} {y} -.01"/>'
-        for i, (x, y, w, d) in enumerate(boxes)
-    )
+    wall = '<geom name="block{}" type="box" pos="{} {} -.01" size="{} {} .01"/>'
+    walls = "".join(wall.format(i, *box) for i, box in enumerate(boxes))
     at, down = peg.offset_mm / 1000, LENGTH_M
     place = f"{at - math.sin(lean) * down / 2} 0 {-math.cos(lean) * down / 2}"
     return f"""

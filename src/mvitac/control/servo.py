@@ -71,7 +71,6 @@ def draw_shape(rng: np.random.Generator, kind: str, kinds: list[str]) -> Shape:
     texture = np.float32(rng.uniform(0.02, 0.08)) * feel(*np.meshgrid(axis, axis))
     length = rng.uniform(30, 70, 4)
     slope, way = rng.uniform(0.03, 0.09, 4), rng.uniform(0, 2 * math.pi, 4)
-    waves = np.stack([slope * length / (2 * math.pi), np.cos(way) / length, np.sin(way) / length, 9 * way], axis=1)
     return Shape(
         kind=kind,
         texture=texture,
@@ -79,7 +78,7 @@ def draw_shape(rng: np.random.Generator, kind: str, kinds: list[str]) -> Shape:
         radius_mm=float(rng.choice((-1, 1)) * rng.uniform(12, 40)),
         corner_mm=float(rng.uniform(9, 15)),
         turn_deg=float(rng.choice((-1, 1)) * rng.uniform(25, 60)),
-        waves=waves,
+        waves=np.stack([slope * length / (2 * math.pi), np.cos(way) / length, np.sin(way) / length, 9 * way], axis=1),
         drift=(float(rng.uniform(0.5, 0.8)), float(rng.uniform(0, 0.12))),
     )
 

@@ -12,7 +12,7 @@ degrees, ``loss`` and ``result()``, the suite's sums, are those of the episode.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Any, ClassVar
 
@@ -78,10 +78,9 @@ def rows_of(suite: Any, models: Sequence[Model]) -> list[Row]:
     """The encoder's seeds first, then the controls; ImageNet only where its weights can be had."""
     own = [Row(OWN, model.seed, ridge(encoding(model))) for model in models]
     beside = [Row(n, None if n == "imagenet" else m.seed, ridge(encoding(m))) for n, m in trunks(suite)[0]]
-    known = Row(suite.true, None, None), Row(suite.blind, None, blind)
     scratch = Row("end to end", None, trained(open_model(suite.untrained[0]), suite.train_steps))
-    shuffled = Row(SHUFFLED, own[0].seed, own[0].learn)
-    return [*own, Row("pixels", None, ridge(pixels)), *beside, shuffled, *known, scratch]
+    known = replace(own[0], source=SHUFFLED), Row(suite.true, None, None), Row(suite.blind, None, blind)
+    return [*own, Row("pixels", None, ridge(pixels)), *beside, *known, scratch]
 
 
 def score(suite: Any, row: Row) -> list[dict[str, Any]]:

@@ -43,9 +43,7 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str
     for task in chosen(pack, session)[0]:
         split_rows(pack, task)  # before anything is trained
     session = replace(session, controls=False)
-    possible: list[tuple[Row, Pack]] = []
-    left_out: dict[str, str] = {}
-    seen: dict[str, str] = {}
+    possible, left_out, seen = list[tuple[Row, Pack]](), dict[str, str](), dict[str, str]()
     for row in plan.rows:
         if row.label in pack.spec.controls:
             raise ValueError(f"row {row.label!r} has the name of a control of this data: give it another label")

@@ -60,7 +60,6 @@ def gather_folds(plan: Plan, works: Sequence[Work], out: Path, session: ProbeCon
     results = [gather(work, out / fold, session) for work, (fold, _) in zip(works, plan.in_folds(), strict=True)]
     if len(results) == 1:
         return {**results[0], "plan": to_json(plan)}
-    retrieval = [r for result in results for r in result["retrieval"] if r["num_groups"] >= MIN_GALLERY]
     lists = ("notes", "run_commits", "run_devices", "unfinished")
     named = ("failed", "run_precisions")  # by the name of a run, of which the fold is part
     return {
@@ -68,7 +67,7 @@ def gather_folds(plan: Plan, works: Sequence[Work], out: Path, session: ProbeCon
         "plan": to_json(plan),
         "pack": digest([result["pack"] for result in results]),
         "records": pool([result["records"] for result in results]),
-        "retrieval": pool_retrieval(retrieval),
+        "retrieval": pool_retrieval([r for one in results for r in one["retrieval"] if r["num_groups"] >= MIN_GALLERY]),
         **{key: list(dict.fromkeys(value for result in results for value in result[key])) for key in lists},
         **{key: dict(pair for result in results for pair in result[key].items()) for key in named},
         "leaks": "; ".join(dict.fromkeys(result["leaks"] for result in results if result["leaks"])),

@@ -245,8 +245,7 @@ def _fraction(job: _Job, percent: float, sources: list[Source] | None) -> tuple[
             more: dict[str, Any] = {"loggers": (job.forecast,), "validate": False}  # all groups are learned from
             train(run, path, resume=True, quiet=job.quiet, pack=job.pack, **more)
             own = own_heads(load(path), job.pack, job.tasks, [job.modality])
-            own = job.named(own, kind, percent, seed, read_sources(path))
-            own = [{**record, "run": str(path)} for record in own]
+            own = [{**r, "run": str(path)} for r in job.named(own, kind, percent, seed, read_sources(path))]
             scores = {"data": job.pack.spec.name, "pack": job.pack.digest, "records": own}
             write_json(path / "scores.json", scores, sealed=True)
             records += own

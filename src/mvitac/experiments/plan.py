@@ -75,14 +75,13 @@ class Plan:
         for name in [name for name in fixed if name in given]:
             raise ValueError(f"{name}: {fixed[name]}")
         folders = [slug(label).encode() for label in labels]
-        if not all(folder.strip(b".") and len(folder) < 200 for folder in folders) or "*" in "".join(
-            labels
-        ):  # a control
+        possible = all(folder.strip(b".") and len(folder) < 200 for folder in folders)
+        if not possible or "*" in "".join(labels):  # of a control
             how = "a label of letters or digits, under 200 bytes, without *"
             raise ValueError(f"plan {self.name!r}: give each row {how}")
         if taken := sorted(set(labels) & set(CONTROLS)):
             raise ValueError(f"row {taken[0]!r} has the name of a control: give it another label")
-        if len({slug(label) for label in labels}) < len(labels):
+        if len({*folders}) < len(labels):
             raise ValueError(f"plan {self.name!r}: two labels are one, but for case and punctuation: rename one")
         if not labels:
             raise ValueError(f"plan {self.name!r}: rows is empty, give one or more")

@@ -34,9 +34,7 @@ def write_tables(result: dict[str, Any], out: Path) -> list[Path]:
 def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
     """The whole comparison as Markdown: what was compared, the tables, retrieval and cost."""
     plan = plan_of(result)
-    text = [f"# {plan.title or plan.name}"]
-    for paragraph in _preface(result, plan, lines):
-        text += ["", paragraph]
+    text = ["\n\n".join([f"# {plan.title or plan.name}", *_preface(result, plan, lines)])]
     for task, heads, rows in _tables(result, lines):
         text += [f"**{task}**: {TARGETS}"] * bool(task) + ["", *pipes(heads, rows)]
     if rows := retrieval_rows(result["retrieval"]):
