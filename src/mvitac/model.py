@@ -286,9 +286,7 @@ class Model(nn.Module):
 
         ``half``: kernels and matrices in fp16, which halves the file. They are fp32 again once loaded.
         """
-        tensors = tensors_of(self)
-        if half:
-            tensors = {name: t.half() if t.ndim > 1 else t for name, t in tensors.items()}
+        tensors = {name: t.half() if half and t.ndim > 1 else t for name, t in tensors_of(self).items()}
         about = json.dumps(to_json(self.run)), json.dumps(to_json(self.spec)), str(self.stored)
         write_model(path, tensors, dict(zip(ABOUT, about, strict=True)))
 

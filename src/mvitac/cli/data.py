@@ -140,8 +140,7 @@ def measured(pack: Pack, rows: np.ndarray) -> list[dict[str, Any]]:
 def _majority(pack: Pack, task: Task, split: str) -> dict[str, Any] | None:
     """The most frequent class of a task in ``split`` and its share of the labelled rows; None without labels."""
     labels = pack.column(f"label_{task.name}")[pack.rows(split, only=task.only, by=task.split)]
-    labels = labels[labels >= 0]
-    if not len(labels):
+    if not len(labels := labels[labels >= 0]):
         return None
     common = int(np.bincount(labels).argmax())
     return {"class": task.classes[common], "share": float((labels == common).mean())}

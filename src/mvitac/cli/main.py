@@ -127,8 +127,7 @@ def _check_choices(rest: Sequence[str], text: Path) -> None:
         if not known or known[1] not in rest:
             continue
         option, choices = known[1], known[2].split("|")
-        value = next(iter(rest[rest.index(option) + 1 :]), choices[0])
-        if value in choices:
+        if (value := next(iter(rest[rest.index(option) + 1 :]), choices[0])) in choices:
             continue
         if Path(value).exists():
             if option == "--data" and (twice := {word.partition("=")[0] for word in rest} & {"--data.path", "--path"}):

@@ -74,9 +74,8 @@ def build(
     if not out.name:
         raise ValueError(f"{out} already exists: choose another --out")
     if not out.exists() or not exist_ok:  # also takes away the lock of a process that was killed at its end
-        with hold_lock(
-            out, f"{out} is being packed by another process: waiting for it", wait=True, quiet=quiet
-        ) as left:
+        busy = f"{out} is being packed by another process: waiting for it"
+        with hold_lock(out, busy, wait=True, quiet=quiet) as left:
             partial = out.with_name(out.name + ".partial")
             if partial.exists() and not (left or (partial / "request.json").exists()):
                 raise ValueError(f"{partial} is no unfinished pack: delete it, or choose another --out")

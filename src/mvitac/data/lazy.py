@@ -67,8 +67,7 @@ class Pieces(Lazy):
 
     def _made(self, rows: np.ndarray) -> np.ndarray:
         numbers = np.searchsorted(self._starts, rows, side="right") - 1
-        found = np.unique(numbers).tolist()
-        if len(found) == 1:
+        if len(found := np.unique(numbers).tolist()) == 1:
             return self._of(found[0], rows)
         images = np.empty((len(rows), *self.shape[1:]), np.uint8)
         for number in found:

@@ -97,8 +97,7 @@ class MixedPack(_Several):
 
     def shares(self, rows: np.ndarray) -> np.ndarray:
         """Share [parts] of each part in the rows that training draws from ``rows``."""
-        sizes = np.bincount(self.part_of[rows], minlength=len(self.parts))
-        drawn = np.array(self.weights) if self.weights else sizes
+        drawn = np.array(self.weights or np.bincount(self.part_of[rows], minlength=len(self.parts)))
         return drawn / drawn.sum()
 
     def alone(self, part: str) -> Pack:
@@ -133,8 +132,7 @@ def _shared_by_parts(parts: Mapping[str, Pack]) -> str:
         hashes = list(zip(("id", "group"), row_hashes(one), row_hashes(other), strict=True))
         where = f"{SHARED} {a} and in test of part {b}, one of"
         for column, ours, theirs in hashes[::-1]:
-            both = scored[np.isin(theirs[scored], ours[learned])]
-            if len(both):
+            if len(both := scored[np.isin(theirs[scored], ours[learned])]):
                 by = other.spec.group_by if column == "group" else "row"
                 return f"{by} {str(other.column(column)[both[0]])!r} {where} {len(np.unique(theirs[both]))}"
         if found := _known_image(other, scored, image_sums(one)[learned]):

@@ -186,8 +186,7 @@ class _Run:
 
 
 def _shown(packet: Packet) -> int:
-    time = packet.pts if packet.pts is not None else packet.dts
-    if time is None:
+    if (time := packet.dts if packet.pts is None else packet.pts) is None:
         raise ValueError("its frames carry no times: convert it, e.g. with ffmpeg -i IN -c:v copy OUT.mp4")
     return time
 

@@ -109,8 +109,7 @@ def _touch(pack: Pack, rows: np.ndarray) -> str:
 def places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
     """Name and values [N] of the column that orders the frames."""
     asked = (window.order,) if window.order else ORDER
-    name = next((column for column in asked if column in pack.table.column_names), None)
-    if name is None:
+    if (name := next((column for column in asked if column in pack.table.column_names), None)) is None:
         raise ValueError(f"{pack.path} has no {', '.join(asked)} to order frames: name another --data.order")
     place = np.array([_number(cell) for cell in pack.column(name)])
     if not np.isfinite(place).all():

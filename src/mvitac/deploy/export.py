@@ -56,8 +56,7 @@ def export(
         if {*fitting(model, given, asked, in_use=True)} != {*asked}:
             raise ValueError(f"{given.path} cannot check this model: it needs images of {' and '.join(asked)}")
     graph = ExportModule(model, asked, learn_looks(known, new, NEW_SENSOR) if new else None)
-    rows = pack.rows("test", having=asked)
-    if not len(rows):  # of a recording
+    if not len(rows := pack.rows("test", having=asked)):  # of a recording
         rows = np.flatnonzero(np.logical_and.reduce([pack.has(modality) for modality in asked]))
     if not len(rows):
         raise ValueError(f"{pack.path} has no rows with {' and '.join(asked)} to check the export on")
@@ -111,8 +110,7 @@ def _checked(path: Path, precision: str, check: Callable[[Call], Any]) -> tuple[
 
 
 def _examples(graph: ExportModule, pack: Pack) -> list[list[np.ndarray]]:
-    rows = pack.rows("train", "unlabelled", having=graph.modalities)
-    if not len(rows):
+    if not len(rows := pack.rows("train", "unlabelled", having=graph.modalities)):
         raise ValueError(f"{pack.path} has no rows in split train: int8 takes its ranges from them")
     return [[pack.images[m][r : r + 1] for m in graph.modalities] for r in sample(rows, NUM_CALIBRATION)]
 
@@ -214,8 +212,7 @@ def _error(
 
 def labels_of(pack: Pack, task: str, classes: list[str], rows: np.ndarray) -> np.ndarray:
     """Labels [len(rows)] of pack rows as indices into ``classes``, matched by name; -1 = unlabelled or unknown class."""
-    own = next((t.classes for t in pack.spec.tasks if t.name == task), None)
-    if own is None:
+    if (own := next((t.classes for t in pack.spec.tasks if t.name == task), None)) is None:
         return np.full(len(rows), -1)
     numbers = np.array([*(classes.index(name) if name in classes else -1 for name in own), -1])
     return numbers[pack.column(f"label_{task}")[rows].astype(int)]

@@ -42,8 +42,7 @@ class ObservationEncoder(nn.Module):
             model.check_modality(modality)
             self.keys.setdefault(modality, []).append(key)
         for modality, names in self.keys.items():
-            wanted = model.spec.channels(modality) // 3
-            if len(names) != wanted:
+            if len(names) != (wanted := model.spec.channels(modality) // 3):
                 raise ValueError(f"the {modality} encoder takes {wanted} image(s), given: {', '.join(names)}")
         # Copies: a policy that tunes its encoders changes neither ``model`` nor another policy.
         self.encoders = nn.ModuleDict({m: copy.deepcopy(model.encoders[m]) for m in self.keys})
@@ -65,8 +64,7 @@ class ObservationEncoder(nn.Module):
         lead = features.shape[:-1]
         if not self.state:
             return features
-        state = observation[STATE]
-        if state.shape != (*lead, self.state):
+        if (state := observation[STATE]).shape != (*lead, self.state):
             raise ValueError(f"{STATE}: expected {(*lead, self.state)}, got {tuple(state.shape)}")
         return torch.cat([features, state.float()], dim=-1)
 

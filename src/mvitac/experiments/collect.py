@@ -101,8 +101,7 @@ def _check_row(plan: Plan, row: Row, pack: Pack) -> tuple[Pack, str]:
 def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
     """Collect the finished runs and the controls into the result that tables are made from; ValueError without runs."""
     failed = {job.name: job.failure for job in work.jobs if job.failure}
-    finished = [job for job in work.jobs if job.done and not job.failure]
-    if not finished:
+    if not (finished := [job for job in work.jobs if job.done and not job.failure]):
         lost = "; ".join(["nothing to show yet", *(f"{name}: {error}" for name, error in failed.items())])
         raise ValueError(f"no run of {out} is finished with probes {' '.join(session.probes)}: {lost}")
     scored = [_scores(job) for job in finished]

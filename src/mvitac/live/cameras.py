@@ -68,8 +68,7 @@ class Camera(Source):
 
         target: int | str = int(self.which) if self.which.isdigit() else self.which
         if isinstance(target, str) and not target.startswith("/"):
-            links = sorted(Path("/dev/v4l/by-id").glob(f"*{glob.escape(target)}*-index0"))
-            if not links:
+            if not (links := sorted(Path("/dev/v4l/by-id").glob(f"*{glob.escape(target)}*-index0"))):
                 raise OSError(f"no camera with serial {target} is plugged in")
             target = str(links[0].resolve())
         self.capture = cv2.VideoCapture(target)

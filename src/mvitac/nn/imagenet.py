@@ -42,8 +42,7 @@ def source(trunk: str) -> str:
 
 def load(trunk: str, arguments: dict[str, Any]) -> nn.Module:
     """timm's ``trunk`` with its ImageNet weights, made with ``arguments``. ValueError if they cannot be had."""
-    package = None if _is_cached(trunk) else _installed(trunk)
-    if package:
+    if not _is_cached(trunk) and (package := _installed(trunk)):
         made = timm.create_model(trunk, **arguments)
         known: Any = made.pretrained_cfg
         cfg = {**known, "state_dict": {**_renamed(trunk, package)}}

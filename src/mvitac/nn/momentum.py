@@ -36,6 +36,5 @@ class Momentum(nn.Module):
         torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage] - one call for all tensors
             [k for k, _ in floating], [q.detach() for _, q in floating], 1 - m
         )
-        counters = [(k, q) for k, q in zip(mine, theirs, strict=True) if not k.is_floating_point()]
-        if counters:
+        if counters := [(k, q) for k, q in zip(mine, theirs, strict=True) if not k.is_floating_point()]:
             torch._foreach_copy_([k for k, _ in counters], [q for _, q in counters])  # pyright: ignore[reportPrivateImportUsage]

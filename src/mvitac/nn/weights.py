@@ -194,8 +194,7 @@ def _cfg(network: nn.Module) -> dict[str, Any]:
 
 def stem_names(trunk: nn.Module) -> list[str]:
     """Names of the convolutions of a timm model that see the image."""
-    known = _cfg(trunk).get("first_conv")
-    if known:
+    if known := _cfg(trunk).get("first_conv"):
         return [known] if isinstance(known, str) else list(known)
     return [name for name, module in trunk.named_modules() if isinstance(module, nn.Conv2d)][:1]
 

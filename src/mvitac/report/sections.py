@@ -71,8 +71,7 @@ class Study:
 
 def retrieval(study: Study) -> list[Markup]:
     """Recall of both directions, and what chance gives."""
-    found = study.result["retrieval"]
-    if not found:
+    if not (found := study.result["retrieval"]):
         needs = f"a space that both modalities share and {MIN_GALLERY} test {study.pack.spec.group_by}s with both"
         return [html.paragraph(f"Not scored: it takes {needs}.")]
     by, num = study.pack.spec.group_by, found[0]["num_groups"]

@@ -141,8 +141,7 @@ def _surface(
     albedo, gloss, glow = (values[geom] for values in _finishes(bench.model, view))
     finish, data = bench.thing.finish, bench.data
     for part, i in zip(bench.thing.parts, bench.parts, strict=True):
-        seen = geom == i
-        if not seen.any():
+        if not (seen := geom == i).any():
             continue
         if part.density > 1.2:
             albedo[seen], gloss[seen] = [0.42, 0.43, 0.45], 1.0

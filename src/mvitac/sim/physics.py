@@ -135,8 +135,7 @@ class Bench:
     def _touch(self, side: int) -> Touch:
         total, force = np.zeros(3), np.zeros(6)
         for i in range(self.data.ncon):
-            pair = self.data.contact.geom[i]
-            if self.pads[side] in pair:
+            if self.pads[side] in (pair := self.data.contact.geom[i]):
                 mujoco.mj_contactForce(self.model, self.data, i, force)
                 world = self.data.contact.frame[i].reshape(3, 3).T @ force[:3]
                 total += world if pair[1] == self.pads[side] else -world

@@ -67,8 +67,7 @@ def cells(u: F, v: F, t: NDArray[np.float32], regular: float = 0.0) -> tuple[F, 
     a, b = u - fu, v - fv
     first = np.full(u.shape, 9.0, np.float32)
     second, owner = first.copy(), np.zeros(u.shape, np.int32)
-    spread = np.float32(0.29 * (1 - regular))
-    px, py = (0.5 + spread * np.clip(t[:2], -1.7, 1.7)).reshape(2, -1)
+    px, py = (0.5 + np.float32(0.29 * (1 - regular)) * np.clip(t[:2], -1.7, 1.7)).reshape(2, -1)
     for di in (-1, 0, 1):
         row = ((i + di) & 63) * _SIDE
         for dj in (-1, 0, 1):

@@ -86,8 +86,7 @@ def time_offset(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         when = pack.column(column).astype(float)
     except ValueError:
         return cannot(f"column {column} holds no numbers")
-    curves = motion_correlations(pack, looks, when)
-    if len(curves) < 3:
+    if len(curves := motion_correlations(pack, looks, when)) < 3:
         return cannot(f"{len(curves)} ordered sequences of {2 * MAX_LAG + 2} rows or more, 3 are needed")
     mean, error = curves.mean(0), curves.std(0, ddof=1) / len(curves) ** 0.5
     lag = (best := int(mean.argmax())) - MAX_LAG
