@@ -7,10 +7,6 @@ spoilt) and a free place for output.
 """
 
 import dataclasses
-import functools
-import hashlib
-import json
-import operator
 import os
 import pickle
 import shutil
@@ -38,9 +34,10 @@ from mvitac.methods.mvitac import MViTacConfig
 from mvitac.recipes import recipe
 from mvitac.registry import to_json
 from mvitac.run import Run
-from mvitac.system.files import write_json
+from mvitac.system.files import digest_file
 from mvitac.training.loop import train
 from mvitac.training.views import StepViews
+from support import forged_packs
 from support.forged_packs import Spoil, described, edited, seal
 
 
@@ -61,11 +58,7 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def snapshot(folder: Path) -> dict[str, str]:
     """Every file and folder below ``folder`` with a digest of its bytes."""
-    found = {}
-    for path in sorted(folder.rglob("*")):
-        content = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "folder"
-        found[str(path.relative_to(folder))] = content
-    return found
+    return {str(p.relative_to(folder)): digest_file(p) if p.is_file() else "folder" for p in folder.rglob("*")}
 
 
 @pytest.fixture
@@ -238,9 +231,8 @@ def test_impossible_numbers_that_only_python_sets() -> None:
     assert {"optim.eps", "method.hidden", "augment.touch.jitter", "data.quality"} <= set(fixed)
     for name in fixed:
         record = to_json(run)
-        *outer, last = name.split(".")
-        functools.reduce(operator.getitem, outer, record)[last] = -1
-        with pytest.raises(ValueError, match=last):
+        forged_packs.put(*name.split("."), value=-1)(record)
+        with pytest.raises(ValueError, match=name.split(".")[-1]):
             Run.load(record)
 
 
@@ -254,15 +246,8 @@ def leaves(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
 
 def test_a_record_with_a_field_of_the_wrong_type(refused: Callable[..., str], finished: Path, tmp_path: Path) -> None:
     """An object where a value belongs, for every value of a run."""
-    record = json.loads((finished / "run.json").read_text())
-    record.pop("sha256", None)
     for leaf in leaves(to_json(recipe("smoke", PackConfig(), phased=False))):
-        spoilt = json.loads(json.dumps(record))
-        inner = spoilt["run"]
-        for key in leaf[:-1]:
-            inner = inner[key]
-        inner[leaf[-1]] = {"surprise": 1}
-        write_json(tmp_path / "run.json", spoilt)
+        edited(Path(shutil.copy(finished / "run.json", tmp_path)), ("run", *leaf), {"surprise": 1})
         refused("pretrain --from {tmp}/run.json --out {out}", "run.json", leaf[-1])
 
 
