@@ -90,9 +90,6 @@ class Counter(Rig):
 class Seeing:
     """An engine of windows that keeps what it was shown: the level of each frame of touch."""
 
-    classes: dict[str, list[str]]
-    values: dict[str, Any]
-
     def __init__(self, frames: int = 3, stride: float = 1.0, order: str = "frame", **window: Any) -> None:
         window = {"of": ["touch"], "minus_first": False, **window}
         self.window = {"frames": frames, "stride": stride, "order": order, **window}
@@ -137,8 +134,7 @@ def test_dropped_frames_do_not_shift_a_window() -> None:
 def test_the_background_stands_for_the_first_frame() -> None:
     found = play(Seeing(frames=2, minus_first=True), EVEN)
     free, *later = (np.full((1, 1, 3), value, np.uint8) for value in (10, 60 + 14, 60 + 13))
-    levels = [difference(image, free)[0, 0, 0] for image in later]
-    assert [level + 60 for level in found[-1]] == levels
+    assert [level + 60 for level in found[-1]] == [difference(image, free)[0, 0, 0] for image in later]
     with pytest.raises(ValueError, match="background of touch alone"):
         play(Seeing(minus_first=True, of=["touch", "vision"]), [])
 
@@ -161,8 +157,7 @@ def test_exported_windows(published: Path, measured: Pack, tmp_path: Path, capsy
     assert engine.inputs["touch"] == (32, 32, 6) and frame_shapes(engine)["touch"] == (32, 32, 3)
     assert engine.window and engine.window["order"] == "frame"
     images = {m: np.asarray(windowed(measured, Window(frames=2)).images[m][[3, 4]]) for m in ("vision", "touch")}
-    wanted = model.predict(**images)["light"]
-    np.testing.assert_allclose(engine(**images)["value_light"], wanted, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(engine(**images)["value_light"], model.predict(**images)["light"], rtol=1e-3, atol=1e-3)
     with pytest.raises(ValueError, match="touch: expected uint8"):
         engine(vision=images["vision"], touch=images["touch"][..., :3])
     for vision in (images["vision"][:1], images["vision"][:0]):

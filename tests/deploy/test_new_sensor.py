@@ -58,8 +58,7 @@ def new(tmp_path_factory: pytest.TempPathFactory) -> Pack:
 
 @pytest.fixture(scope="module")
 def run(old: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = smoke(old, steps=4, eval_every=0)
-    return train(run, tmp_path_factory.mktemp("run") / "run", quiet=True, validate=False)
+    return train(smoke(old, steps=4, eval_every=0), tmp_path_factory.mktemp("run") / "run", quiet=True, validate=False)
 
 
 @pytest.fixture(scope="module")

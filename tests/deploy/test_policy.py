@@ -1,21 +1,13 @@
 """The encoders inside a policy."""
 
-from pathlib import Path
-
 import pytest
 import torch
 
-import mvitac
 from mvitac.data.pack import Pack
 from mvitac.deploy.policy import ObservationEncoder
 from mvitac.model import Model
 
 KEYS = {"observation.images.wrist": "vision", "observation.images.gel": "touch"}
-
-
-@pytest.fixture
-def model(artifact: Path) -> Model:
-    return mvitac.load(artifact)
 
 
 def observe(pack: Pack, rows: list[int]) -> dict[str, torch.Tensor]:

@@ -170,8 +170,7 @@ def test_minutes_of_faults(engine: Engine) -> None:
             assert not others, (i, fault, stream, others)
             made.add((fault, stream))
             del world.heard[:]
-            pages = int(Path("/proc/self/statm").read_text().split()[1])
-            memory.append((tracemalloc.get_traced_memory()[0], pages))
+            memory.append((tracemalloc.get_traced_memory()[0], int(Path("/proc/self/statm").read_text().split()[1])))
     finally:
         tracemalloc.stop()
     assert len(made) == 10 and world.live.num_touches > num * (seconds - 15) / 3
@@ -549,13 +548,8 @@ def test_sigterm_ends_it_as_ctrl_c_does(
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-@pytest.fixture(scope="module")
-def measuring(value_onnx: Path) -> Engine:
-    return Engine(value_onnx, threads=1)
-
-
-def test_a_value_is_that_of_the_newest_frame_with_the_spread_of_its_range(measuring: Engine) -> None:
-    given = iter([1.0, 5.0, 3.0, 3.0, 3.0])
+def test_a_value_is_that_of_the_newest_frame_with_the_spread_of_its_range(value_onnx: Path) -> None:
+    measuring, given = Engine(value_onnx, threads=1), iter([1.0, 5.0])
 
     class Rising(Other):
         """Says 1, 5, 3, 3, ... levels; errors are 0.25 below 2 levels and 0.5 from there."""

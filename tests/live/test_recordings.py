@@ -92,8 +92,7 @@ def test_damaged_frames_are_left_out(engine: Engine, films: dict[str, Path], tmp
 def test_pictures_named_by_their_time_are_at_it(tmp_path: Path) -> None:
     for time in (1_700_000_000.25, 1_700_000_000.5, 1_700_000_020):
         Image.new("RGB", (8, 8)).save(tmp_path / f"{time}.png")
-    stamped = recording(str(tmp_path))
-    assert (stamped.times - 1_700_000_000).tolist() == [0.25, 0.5, 20]
+    assert (recording(str(tmp_path)).times - 1_700_000_000).tolist() == [0.25, 0.5, 20]
     assert recording(f"{tmp_path}@5").times.tolist() == [0, 0.2, 0.4]
     (tmp_path / "free.png").write_bytes(b"")
     with pytest.raises(ValueError, match="image 'free' has no time in its name"):
@@ -215,7 +214,7 @@ def test_predict_command(
     assert own.spec.difference and (own.images["touch"] == 128).all()
     (tmp_path / "gel.csv").write_text("touch\ntouch.png\n")
     Image.fromarray(pack.images["touch"][8]).save(tmp_path / "other.png")
-    (tmp_path / "two.csv").write_text("vision,left,right\nvision.png,touch.png,other.png\n")
+    (two := tmp_path / "two.csv").write_text("vision,left,right\nvision.png,touch.png,other.png\n")
     (empty := tmp_path / "empty").mkdir()
     wrong = {
         (): "give one SOURCE",
@@ -225,9 +224,7 @@ def test_predict_command(
         ("--vision", "0", *both[2:]): "give a video",
         (str(empty),): "holds no pictures",
         (str(tmp_path / "some16"),): "some16 has images of vision of (16, 16, 3), the model takes (32, 32, 3)",
-        (
-            str(tmp_path / "two.csv"),
-        ): f"error: {tmp_path / 'two.csv'} has images of touch of (32, 32, 6), the model takes (",
+        (str(two),): f"error: {two} has images of touch of (32, 32, 6), the model takes (",
         (str(tmp_path / "gel.csv"),): "has no vision, which the model takes too",
     }
     for words, says in wrong.items():
@@ -246,8 +243,7 @@ def test_a_crop_is_what_the_model_sees(engine: Engine, films: dict[str, Path], t
         tables.append(whole(Recordings(engine, files, LiveConfig(), background).tables()))
     assert all(np.array_equal(values, tables[1][name]) for name, values in tables[0].items())
     assert tables[0]["contact"].sum() == NUM - FREE
-    beyond = {**opened(films), "touch": [recording(f"{films['touch']}#100:0:80:60")]}
-    large = Recordings(engine, beyond, LiveConfig())
+    large = Recordings(engine, opened(films) | {"touch": [recording(f"{films['touch']}#100:0:80:60")]}, LiveConfig())
     assert not list(large.tables()) and "crop 100:0:80:60 reaches beyond 160 x 120" in next(iter(large.told))
 
 
