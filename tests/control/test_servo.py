@@ -45,8 +45,7 @@ def done(small: Servo, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def known(monkeypatch: pytest.MonkeyPatch, small: Servo) -> None:
-    find = result.find_suite
-    monkeypatch.setattr(result, "find_suite", lambda name: small if name == small.name else find(name))
+    monkeypatch.setattr(result, "find_suite", lambda name: small if name == small.name else find_suite(name))
     monkeypatch.setattr(result, "shipped", lambda: [small.name, "servo-v1"])
 
 

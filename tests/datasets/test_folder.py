@@ -385,8 +385,7 @@ def test_a_leaking_split_is_refused_unless_allowed(tmp_path: Path, rows: Table) 
 
 def test_another_way_to_write_a_path_hides_no_leak(tmp_path: Path, rows: Table) -> None:
     other = next(row for row in rows if row["side"] == "test")
-    first = next(row for row in rows if row["side"] == "train")
-    other["left"] = f"./left/../{first['left']}"
+    other["left"] = f"./left/../{next(row['left'] for row in rows if row['side'] == 'train')}"
     with pytest.raises(ValueError, match="leaks: 1 of 47 left and right images are in more than one split"):
         config(write(rows, tmp_path / "m.csv"), split="side").source()
 

@@ -287,8 +287,7 @@ def test_tasks_of_one_run_are_probed_together(pack: Pack) -> None:
     def matrix(modality: str, rows: np.ndarray) -> np.ndarray:
         return x[[int(np.flatnonzero(order == row)[0]) for row in rows]]
 
-    records = probe_all(matrix, pack, tasks, ["touch"], ["paper"], 3)
-    for task, record in zip(tasks, records, strict=True):
+    for task, record in zip(tasks, probe_all(matrix, pack, tasks, ["touch"], ["paper"], 3), strict=True):
         alone = probe_features(x, pack, task, split_rows(pack, task), "paper", 3)[0]
         assert record["accuracy"] == alone["accuracy"] and record["confusion"] == alone["confusion"]
 

@@ -175,8 +175,7 @@ def test_methods_of_these_plans_see_equally_many_images(pack: Pack, name: str) -
     for row in plan.rows:
         run = plan.run(row, PackConfig(), 0, phased=False)
         if not run.method.needs_pairs and row.label not in ("ViT, not trained", "supervised, 96 px"):
-            method = run.method.on_tiny_trunk(spec, run.encoder)
-            seen[row.label] = (run.steps or 0) * run.batch_size * method.views
+            seen[row.label] = (run.steps or 0) * run.batch_size * run.method.on_tiny_trunk(spec, run.encoder).views
     assert len(seen) > 8 and len(set(seen.values())) == 1, seen
 
 
@@ -459,8 +458,7 @@ def test_names_and_units_are_text_in_latex_and_markdown() -> None:
 
 
 def command(pack: Pack, plan: Path, out: Path, *more: str) -> list[str]:
-    choice = ["--plan", str(plan), "--data", "pack", "--data.path", str(pack.path), "--out", str(out)]
-    return ["compare", *choice, *more]
+    return ["compare", "--plan", str(plan), "--data", "pack", "--data.path", str(pack.path), "--out", str(out), *more]
 
 
 def write_plan(path: Path, num_rows: int, seeds: int, steps: int) -> Path:
@@ -522,8 +520,7 @@ def two_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         thing = i % 8
         for name in ("v", "t"):
             picture(tmp_path / f"{name}{i}.png", 60 + 90 * (thing % 2) + i)
-        first = "test" if thing < 4 else "train"
-        second = {"test": "train", "train": "test"}[first]
+        first, second = ("test", "train") if thing < 4 else ("train", "test")
         few = "test" if thing == 7 else "train"
         lines.append(f"v{i}.png,t{i}.png,{'ab'[thing % 2]},{thing},{first},{second},{first},{few}")
     (tmp_path / "pairs.csv").write_text("\n".join(lines))

@@ -152,8 +152,7 @@ def test_a_trunk_of_others_is_a_start_too(pack: Pack, tmp_path: Path, monkeypatc
 
 def test_a_rate_that_diverges_is_not_chosen(ancestor: Path, pack: Pack, tmp_path: Path) -> None:
     said: list[str] = []
-    asked = replace(ASKED, lr=(1e12, 1e-3), from_scratch=False)
-    found = tune(ancestor, pack, tmp_path / "out", asked, say=said.append)
+    found = tune(ancestor, pack, tmp_path / "out", replace(ASKED, lr=(1e12, 1e-3), from_scratch=False), say=said.append)
     assert found["chosen"]["100"]["fine-tuned"]["lr"] == 1e-3 and any("diverged" in line for line in said)
 
 
@@ -209,8 +208,7 @@ def test_killed_and_resumed_is_straight(ancestor: Path, pack: Pack, tuned: Path,
     assert_equal_weights(tmp_path / "out" / "seed0", tuned / "seed0")
     straight = [r for r in json.loads((tuned / "scores.json").read_text())["records"] if r["fraction"] == 100]
     for record in result["records"]:
-        same = next(r for r in straight if r["source"] == record["source"])
-        assert record["group_correct"] == same["group_correct"]
+        assert record["group_correct"] == next(r for r in straight if r["source"] == record["source"])["group_correct"]
 
 
 def test_what_was_tried_on_other_labels_is_tried_again(ancestor: Path, pack: Pack, tmp_path: Path) -> None:
@@ -258,8 +256,7 @@ def test_bad_input_is_refused(ancestor: Path, pack: Pack, tmp_path: Path, capsys
 
 def test_a_leak_of_the_ancestor_stands_beside_the_score(ancestor: Path, pack: Pack, tmp_path: Path) -> None:
     seen = edited(pack, tmp_path / "seen", split=lambda row: SWAPPED[row["split"]])
-    asked = replace(ASKED, lr=(1e-3,), allow_leak=True)
-    records = tune(ancestor, Pack(seen), tmp_path / "out", asked)["records"]
+    records = tune(ancestor, Pack(seen), tmp_path / "out", replace(ASKED, lr=(1e-3,), allow_leak=True))["records"]
     leaks = {r["source"]: r["leak"] for r in records}
     assert "72 of 72 test rows" in leaks["fine-tuned"] and "72 of 72" in leaks[FROZEN] and leaks[SCRATCH] == ""
     scratch = tmp_path / "out" / "scratch" / "seed0"  # saw its own train alone, which the other split tests

@@ -64,8 +64,7 @@ def test_sensors_are_drawn_from_one_side_and_leave_physics_and_camera_alone():
 @pytest.mark.parametrize("kind", ["box", "can", "rod", "capsule", "mug"])
 def test_a_firm_centred_grip_holds_and_a_heavy_or_slippery_thing_slips(kind):
     some = thing(kind)
-    middle = (some.bounds[0] + some.bounds[1]) / 2
-    centred = (0.0, float(some.center_of_mass[1] - middle[1]), 0.0)
+    centred = (0.0, float(some.center_of_mass[1] - np.mean(some.bounds, axis=0)[1]), 0.0)
     assert outcome(some, plan(force_n=10.0, offset_m=centred)).success == 1
     heavy = dataclasses.replace(some, density=some.density * 12 / (some.mass * 9.81))
     assert outcome(heavy, plan(force_n=10.0, offset_m=centred)).success == 0
