@@ -108,12 +108,11 @@ def read_parts(
         keep_freed_memory()
         yield from (reader(*part) for part in parts)
         return
-    # spawn: a forked child may inherit locks held by torch. Starting a worker is cheap, because it does not import torch.
-    context = multiprocessing.get_context("spawn")
     ahead: deque[Future[tuple[Part, dict[str, bytes]]]] = deque()
+    # spawn: a forked child may inherit locks held by torch. Starting a worker is cheap, because it does not import torch.
     with (
         tempfile.NamedTemporaryFile(prefix="mvitac-") as file,
-        ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(file.name,)) as pool,
+        ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker, (file.name,)) as pool,
     ):
         # In a file: the pipe to a new process is blocked for ever if that process ends before it has read all.
         file.write(pickle.dumps(reader))

@@ -59,8 +59,7 @@ def covered(group_by: str, records: Sequence[dict[str, Any]]) -> str:
     for record in records:
         if record["seed"] is not None:
             seeds.setdefault(record["source"], set()).add(record["seed"])
-    single = [source for source, found in seeds.items() if len(found) == 1]
-    if not single:
+    if not (single := [source for source, found in seeds.items() if len(found) == 1]):
         return f"over test {group_by}s and seeds"
     if len(single) == len(seeds):
         return f"over test {group_by}s only, for this one seed: they leave out the variation between seeds"

@@ -169,8 +169,7 @@ class MViTac(Contrastive):
         for part, (x, y) in PARTS.items():
             head = "intra" if x == y else "inter"
             found = [row_pairs(z, x, y, ("q", x, i, head), (k, y, j, head)) for i, j in self.view_pairs(head)]
-            terms = [info_nce(*pair, self.config.temperature) for pair in found if pair]
-            if terms:
+            if terms := [info_nce(*pair, self.config.temperature) for pair in found if pair]:
                 losses[part] = torch.stack(terms).mean()  # eq. 8, 11
         weight = {"vt": self.config.lambda_inter, "tv": self.config.lambda_inter}
         minimised = [weight.get(part, 1.0) * loss for part, loss in losses.items() if part in self.config.losses]

@@ -76,8 +76,7 @@ def grasp(
     sensor = sensors[int(feel.random() * len(sensors))]
     units, gain = feel.integers(2**31, size=2).tolist(), feel.uniform(0.75, 1.3)
     known = {"object": thing.name, "sensor": sensor.name, **_latents(thing, patch, plan)}
-    rows = []
-    outcome: dict[str, float] = {}
+    rows, outcome = [], dict[str, float]()
     for order, moment in enumerate(bench.moments(plan), 1):
         touch_rng, view_rng = (np.random.default_rng([tag, *key, order]) for tag in (_TOUCH, _VIEW))
         row: dict[str, Any] = {"phase": moment.phase, **known}

@@ -111,8 +111,7 @@ def _record(setup: Setup, asked: Run, out: Path, start: Start | None, taken: dic
         record |= {leaks.LEARNED: leaks.sources_digest(sources)}
         record |= {"device": describe(setup.hardware.device), "precision": run.precision}
         record["bf16_slowdown"], said = setup.hardware.slowdown, []
-        used = [m for m in setup.method.encoders() if run.encoder[m].weights == IMAGENET]
-        if used:
+        if used := [m for m in setup.method.encoders() if run.encoder[m].weights == IMAGENET]:
             record["imagenet"] = {m: source(run.encoder[m].trunk) for m in used}
             said += [f"{m} starts from ImageNet weights of {found}" for m, found in record["imagenet"].items()]
         if start:

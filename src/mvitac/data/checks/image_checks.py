@@ -33,8 +33,7 @@ def red_and_blue(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     """
     notes, rows, compared = [], [], False
     for name, one in looks.items():
-        usable = np.flatnonzero(one.seen & ~one.gray)
-        if len(usable) < 8:
+        if len(usable := np.flatnonzero(one.seen & ~one.gray)) < 8:
             notes.append(f"{name}: no colour to compare")
             continue
         usable = usable[np.linspace(0, len(usable) - 1, min(len(usable), 20_000)).astype(int)]

@@ -84,8 +84,7 @@ def leaks(pack: Pack) -> list[Finding]:
             there = counted[pack.table.column(name).is_valid().to_numpy()[counted]]  # a part of a mix may lack it
             values, sides = pack.column(name).astype(str)[there], sides_of(pack.column(split).astype(str)[there])
             on = {side: set(values[sides == side].tolist()) for side in np.unique(sides)}
-            both = sorted({v for a in on for b in on if a < b for v in on[a] & on[b]})
-            if both:
+            if both := sorted({v for a in on for b in on if a < b for v in on[a] & on[b]}):
                 kind = f" ({pack.spec.group_by})" if name == "group" else ""
                 test = on.get("test", set())
                 of = f"; {len(test & on.get('train', set()))} of {len(test)} in test are also in train" if test else ""

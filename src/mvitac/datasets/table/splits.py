@@ -74,8 +74,7 @@ def check_leak(where: str, split: str, what: str, values: Sequence[str], splits:
     sides: dict[str, set[str]] = defaultdict(set)
     for value, side in zip(values, splits, strict=True):
         sides[value].add("train" if side == "unlabelled" else side)
-    leaks = [value for value, found in sides.items() if len(found) > 1]
-    if leaks:
+    if leaks := [value for value, found in sides.items() if len(found) > 1]:
         found = f"{leaks[0]!r} in {' and '.join(sorted(sides[leaks[0]]))}"
         told = f"{len(leaks)} of {len(sides)} {what} are in more than one split, e.g. {found}"
         advice = "give the group" if split == BY_GROUP else f"--data.split {BY_GROUP} assigns whole groups"
