@@ -73,8 +73,7 @@ def test_find_command_draws_what_it_found(
     with Image.open(tmp_path / "found.png") as sheet:
         pixels = np.asarray(sheet)
     for row in (one["row"] for one in found):
-        picture = fit(pack.images["touch"][row], 160)
-        assert any(picture[80].tobytes() in line.tobytes() for line in pixels)
+        assert any(fit(pack.images["touch"][row], 160)[80].tobytes() in line.tobytes() for line in pixels)
     table, other = pq.read_table(known), tmp_path / "other.parquet"
     turned = table.set_column(table.column_names.index("row"), "row", pa.array(range(table.num_rows)[::-1]))
     pq.write_table(turned, other)
