@@ -673,6 +673,8 @@ def test_shipped_suites_keep_their_definitions() -> None:
         (SUITE.replace(RANDOM.format(1), RANDOM.format(1) + ",reads=touch"), "which reads both"),
         (SUITE.replace('"clone" }', '"../clone" }', 1), "not a place below --data-root"),
         (SUITE.replace('name = "pack" }', 'name = "pack", path = "/etc" }', 1), "names a place in 'path'"),
+        (SUITE.replace('name = "pack" }', 'name = "folder", log = ["../log.csv:t"] }', 1), "is not a place below"),
+        ("a = " + "[" * 5000, "too many brackets"),
         (SUITE.replace(FORM, 'data = { name = "mix", parts = ["/a", "/b"] }', 1), "a place in 'parts'"),
         (SUITE.replace(RANDOM.format(0), "external:python:antigravity:fly"), "weights=random, which"),
         (SUITE.replace("external:timm/resnet18.tv_in1k", RANDOM.format(1)), "give external:timm/NAME"),

@@ -207,6 +207,11 @@ def test_the_image_of_one_of_two_gels_is_a_leak(tmp_path: Path) -> None:
     for pack in (packs["b"], windowed(packs["b"], Window(frames=2))):
         assert Scored(pack).leak(seen, np.arange(4)).startswith("4 of 4 test rows and 0 of")
     assert Scored(packs["c"]).leak(seen, np.arange(4)) == ""
+    first, second = [source_of(packs["a"], np.array([0]))], np.array([1])  # the second frame's window shows the first
+    assert Scored(packs["b"]).leak(first, second) == ""
+    assert Scored(windowed(packs["b"], Window(frames=2))).leak(first, second).startswith("1 of 1 test rows")
+    alone = source_of(windowed(packs["a"], Window(frames=2)), second)  # which is trained on both
+    assert Scored(packs["b"]).leak([alone], np.array([0])).startswith("1 of 1 test rows")
 
 
 def test_equal_checksums_by_chance_are_no_leak(pack: Pack) -> None:

@@ -113,6 +113,11 @@ def test_a_touch_ends_with_its_stream(engine: Engine) -> None:
         world.rigs["touch"].fault = fault
         world.run(1)
         assert world.live.touch is None and world.live.last is not None and world.live.contact is None
+    world = World(engine)
+    world.run(2.5)
+    world.rigs["vision"].fault = "unplugged"  # touch leads
+    world.run(0.4)
+    assert world.live.touch is None and world.live.num_touches == 1
 
 
 def test_a_frame_that_comes_while_others_are_taken_is_used_once(engine: Engine) -> None:

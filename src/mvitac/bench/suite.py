@@ -147,7 +147,7 @@ def _check_places(form: Form, config: DatasetConfig) -> None:
     for name in {**form.data, **form.score_on}:
         if "Path" in str(hints.get(name)) or name in ("url", "parts"):
             raise ValueError(f"form {form.name!r} names a place in {name!r}: say in 'at' where it is below --data-root")
-    for place in form.at.values():
+    for place in (*form.at.values(), *(text.rpartition(":")[0] for text in getattr(config, "log", ()))):
         if Path(place).is_absolute() or {"..", "~"} & {*Path(place).parts} or ":" in place:
             raise ValueError(f"form {form.name!r}: {place!r} is not a place below --data-root")
 

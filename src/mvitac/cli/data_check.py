@@ -14,6 +14,7 @@ from mvitac.cli.options import check_json, parse, printed_to, save_json, selecto
 from mvitac.data.checks.examine import Draw, examine_pack, examine_source
 from mvitac.data.checks.finding import Finding, exit_code
 from mvitac.data.pack import Pack
+from mvitac.data.several import MixedPack
 from mvitac.datasets.base import DatasetConfig, dataset
 from mvitac.datasets.mix import open_packs
 from mvitac.datasets.pack import PackConfig
@@ -59,7 +60,10 @@ def check(argv: list[str]) -> int:
         options = parse(_PackOptions, rest, "data check", description=_MANUAL)
         name = " + ".join(options.pack)
         draw_sheet = _sheet(name, options)
-        pack = name if len(options.pack) == 1 else open_packs(options.pack)
+        pack: Any = name
+        if len(options.pack) != 1:  # at the least size: a copy that is enlarged has blurred edges, and is not found
+            parts = open_packs(options.pack).parts
+            pack = MixedPack(parts, size=min(part.size for part in parts.values()), allow_leak=True)
         return _report(name, examine_pack(pack, draw=draw_sheet), options)
     name = f"--data {chosen['--data']}"
     usual = _SourceOptions(data=dataset(chosen["--data"]))

@@ -57,21 +57,30 @@ def _each_sensor(pack: Pack) -> np.ndarray:
     return _KNOWN[pack.digest]
 
 
+def shown(pack: Pack, rows: np.ndarray) -> list[np.ndarray]:
+    """By ``IMAGES``, the rows [n, F] whose images ``rows`` [n] show: those of windows show earlier frames, too."""
+    own = np.arange(pack.num)[:, None]
+    return [getattr(pack.images.get(modality), "index", own)[rows] for modality, _ in IMAGES]
+
+
 def known_images(pack: Pack, rows: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """bool [rows, 4]: which images of ``rows`` are among ``known``, sums of ``image_sums``.
+    """bool [rows, 4]: which images of ``rows`` are among ``known``, sums of ``image_sums``; of windows, any of the frames.
 
     An image of a single value (nothing) does not count, nor do so few equal checksums that chance may explain them.
     """
-    own, known = image_sums(pack)[rows], np.unique(known)
+    every = np.unique(np.concatenate([at.ravel() for at in shown(pack, rows)]))
+    own, known = image_sums(pack)[every], np.unique(known)
     same = (own > 0) & np.isin(own, known)
     for place, (modality, channels) in enumerate(IMAGES):
         for i in np.flatnonzero(same[:, place]):
-            same[i, place] = np.ptp(pack.images[modality][rows[i]][..., channels]) > 0
+            images = getattr(pack.images[modality], "frames", pack.images[modality])  # of windows, single frames
+            same[i, place] = np.ptp(images[every[i]][..., channels]) > 0
         kind = min(place, len(MODALITIES)) + 1
-        expected = len(rows) * np.count_nonzero(known >> np.uint64(32) == kind) / 2**32
+        expected = len(every) * np.count_nonzero(known >> np.uint64(32) == kind) / 2**32
         if (num := same[:, place].sum()) and gammainc(num, expected) > CHANCE:  # of a Poisson number: num or more
             same[:, place] = False
-    return same
+    where = enumerate(shown(pack, rows))
+    return np.stack([same[np.searchsorted(every, at), place].any(axis=1) for place, at in where], axis=1)
 
 
 def _hash(texts: np.ndarray, name: str, weak: bool) -> np.ndarray:

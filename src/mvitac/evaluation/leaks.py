@@ -19,7 +19,7 @@ import safetensors
 import safetensors.numpy
 
 from mvitac.data.pack import Pack
-from mvitac.data.row_hashes import image_sums, known_images, row_hashes
+from mvitac.data.row_hashes import image_sums, known_images, row_hashes, shown
 from mvitac.data.spec import MODALITIES
 from mvitac.nn.encoders import IMAGENET, SCRATCH
 from mvitac.nn.weights import said_trained_on
@@ -46,7 +46,8 @@ class Source:
 
 def source_of(pack: Pack, rows: np.ndarray, what: str = "") -> Source:
     """The source that pack ``rows`` are; ``what`` ends its name."""
-    ids, groups, images = (np.unique(found[rows]) for found in (*row_hashes(pack), image_sums(pack)))
+    (ids, groups), sums = (np.unique(found[rows]) for found in row_hashes(pack)), image_sums(pack)
+    images = np.unique(np.concatenate([sums[at, place].ravel() for place, at in enumerate(shown(pack, rows))]))
     return Source(pack.spec.name + what, ids, groups, images[images > 0])
 
 

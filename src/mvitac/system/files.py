@@ -163,7 +163,10 @@ def parse_toml(text: str) -> Any:
     """Parse TOML, as ``parse_json``."""
     import tomllib  # of Python 3.11: a robot may have 3.10, and needs no TOML
 
-    return parse_json(json.dumps(tomllib.loads(text), default=str))
+    try:
+        return parse_json(json.dumps(tomllib.loads(text), default=str))
+    except RecursionError:
+        raise ValueError("too many brackets inside each other") from None
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

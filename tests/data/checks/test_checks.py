@@ -23,9 +23,11 @@ from mvitac.data.checks.table_checks import similar_names
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Task
+from mvitac.datasets.folder import FolderConfig
 from support.toy import altered
 
 NUM_OBJECTS, NUM_FRAMES, SIDE = 20, 16, 32
+REAL = Path(__file__).resolve().parents[4] / "shared" / "data" / "tactip_shear"
 TEST, VAL = (3, 8, 13, 18), (4, 9)
 
 
@@ -346,6 +348,21 @@ def test_what_two_packs_share_is_a_finding(tmp_path: Path, capsys: pytest.Captur
     assert shared["verdict"] == "broken" and says in shared["evidence"]
     assert found["groups across splits"]["verdict"] == "ok"
     assert main(["data", "info", *both]) == 0 and "is in train or val of part one" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="tactip_shear is not beside the project")
+def test_real_touches_of_another_size_are_found(tmp_path: Path) -> None:
+    """Of 60 touches half is in train of one pack, at 72 px, and in test of the other, at 36 px, and the others so, too."""
+    files = sorted((REAL / "cr_test").glob("*.png"))[:60]
+    for side, size in ((0, 72), (1, 36)):
+        cells = (f"{file},{side}-{i},{('train', 'test')[(i + side) % 2]}" for i, file in enumerate(files))
+        (tmp_path / f"{side}.csv").write_text("\n".join(["touch,object,split", *cells]))
+        source = FolderConfig(path=tmp_path / f"{side}.csv", group="object", title=str(side)).source()
+        build(source, tmp_path / f"pack{side}", size=size, quiet=True)
+    file = tmp_path / "found.json"
+    assert main(["data", "check", *(str(tmp_path / f"pack{side}") for side in (0, 1)), "--json", str(file)]) == 1
+    found = {f["item"]: f for f in json.loads(file.read_text())["findings"]}["near-copies across splits"]
+    assert int(re.search(r"touch: (\d+) of", found["evidence"])[1]) > 30, found["evidence"]  # type: ignore[index]
 
 
 @pytest.mark.parametrize("objects", ["the same", "others", "the same, of two sensors"])
