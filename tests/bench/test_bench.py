@@ -691,6 +691,5 @@ def test_suites_that_are_wrong(text: str, expected: str, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("path", sorted(BOARD.rglob("*.json")), ids=lambda path: path.stem)
 def test_results_in_the_repository(path: Path) -> None:
-    """What a pull request that adds a result is checked by."""
     value = read_result(path)
     assert problems(value) == [] and path.parent.name == value["suite"]["name"] and path.stat().st_size < 400_000

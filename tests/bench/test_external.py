@@ -224,7 +224,6 @@ def test_bad_encoders_are_named_in_one_line(text: str, words: str) -> None:
 
 
 def test_what_probe_writes(pack: Pack, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """All that is needed to check an encoder."""
     encoder = f"external:timm/test_resnet,weights={weights},size=32,licence=CC-BY-NC-4.0,title=theirs,reads=touch"
     out = tmp_path / "scores.json"
     assert main(["probe", "--encoder", encoder, "--on", str(pack.path), "--tasks", "pattern", "--json", str(out)]) == 0

@@ -62,7 +62,6 @@ def test_the_card_names_what_encoders_and_what_probes_learned_from(artifact: Pat
 
 
 def test_the_part_of_images_is_that_of_the_data_of_the_probes(smoke_run: Path, pack: Pack, tmp_path: Path) -> None:
-    """Their answers are for images that show as much."""
     part, run = {"touch": "0:0:9:9"}, shutil.copytree(smoke_run, tmp_path / "run")
     (run / "trained_on.safetensors").chmod(0o600)  # which others can read in an artifact
     publish(run, tmp_path / "a", with_columns(pack, spec=replace(pack.spec, crop=part)), allow_leak=True)

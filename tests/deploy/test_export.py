@@ -299,7 +299,6 @@ def test_predicted_values_score_as_the_artifact_says(value_artifact: Path, measu
 
 
 def test_the_spread_is_that_of_its_range(value_artifact: Path, measured: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a prediction: that of the test rows in its range."""
     monkeypatch.setattr(publish, "RANGE_ROWS", 5)
     model, task = mvitac.load(value_artifact), measured.spec.values[0]
     model.probes = {}

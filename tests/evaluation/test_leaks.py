@@ -86,7 +86,6 @@ def test_leak_is_beside_all_scores(run: Path, turned: Pack, tmp_path: Path, caps
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_forgotten_group_is_told_below_scores(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """By ``data check``, ``probe``, in the report and on the card."""
     rows = []
     for i, split in enumerate(pack.column("split")):
         names = {m: f"{m}{i:03d}.png" for m in ("vision", "touch")}

@@ -280,7 +280,6 @@ def test_seeds_whose_automatic_precision_differs_are_seeds_of_one_run(pack: Pack
 
 
 def test_tasks_of_one_run_are_probed_together(pack: Pack) -> None:
-    """The records are those of each task probed on its own."""
     x, tasks = features_that_know(pack), list(pack.spec.tasks)
     order = split_rows(pack, tasks[0]).all
 
