@@ -100,7 +100,7 @@ def test_frames_that_only_the_rough_lists_name_are_hidden_from_all_else() -> Non
     find_touches(listed)
     lists.assign_official(listed, 0, 0)
     pack = object.__new__(Pack)  # the table alone
-    pack.spec = _spec(TouchAndGoConfig(split="official"), True, (), False)
+    pack.spec, pack.images = _spec(TouchAndGoConfig(split="official"), True, (), False), {}
     pack.table, pack.num = pa.Table.from_pylist([_columns(frame, pack.spec) for frame in listed]), len(listed)
     split, touch = pack.column("split"), pack.column("touch_group")
     named = np.array([frame.listed for frame in listed])
