@@ -245,6 +245,9 @@ def test_damaged_items_stop_or_are_listed(tmp_path: Path, monkeypatch: pytest.Mo
     assert lenient.num == 118 and [name for name, _ in lenient.meta["damaged"]] == ["item 3", "item 40"]
     assert "0003" not in lenient.column("id")
     check_images(lenient, [item for item in range(120) if item not in (3, 40)])
+    monkeypatch.setattr(Toy, "read", lambda self, item: [()][item + 1])  # an array that is shorter than the rows say
+    with pytest.raises(ValueError, match="120 of 120 items cannot be read, first item 0: list index out of range"):
+        build(Toy(), tmp_path / "short", size=32, quiet=True)
 
 
 def check_images(pack: Pack, items: list[int]) -> None:

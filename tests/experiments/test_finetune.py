@@ -235,7 +235,6 @@ SWAPPED = {"test": "train", "train": "test", "val": "val"}
 
 
 def test_bad_input_is_refused(ancestor: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Before anything is written."""
     out, run = tmp_path / "out", str(ancestor)
     first = {"label_pattern": lambda row: row["label_pattern"] * (row["split"] == "test")}
     three = {"group": lambda row: row["split"] + str(row["label_pattern"]) * (row["split"] == "train")}

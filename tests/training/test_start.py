@@ -163,7 +163,6 @@ def chain(pack: Pack, turned: Pack, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 def test_leaks_of_ancestors_are_told(pack: Pack, chain: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
-    """Refused, or marked where they are allowed."""
     for name in ("c", "d"):
         found = read_sources(chain[name])
         assert found and [len(source.ids) for source in found] == [len(pack.rows("train")), len(pack.rows("test"))]
