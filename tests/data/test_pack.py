@@ -218,7 +218,6 @@ def test_killed_while_it_is_finished(pack: Pack, tmp_path: Path, monkeypatch: py
 
 
 def test_an_unfinished_pack_is_continued_by_its_own_data_and_no_leftovers_get_in(pack: Pack, tmp_path: Path) -> None:
-    """Those of a build that was killed at its very end."""
     partial = almost_finished(tmp_path / "p", Toy())
     with pytest.raises(ValueError, match="unfinished pack of something else"):
         toy_pack(tmp_path / "p", num=60)

@@ -183,7 +183,6 @@ def test_an_image_is_what_it_should_be_and_in_its_own_file(kind: str, tmp_path: 
 
 @pytest.mark.parametrize("outcome", [np.nan, "False", -1, 2, h5py.Empty("f")])
 def test_an_outcome_is_a_bool(outcome: Any, tmp_path: Path) -> None:
-    """It was a success, whatever it was."""
     write_shard(tmp_path, 0, [b"lemon"], grip=outcome)
     with pytest.raises(ValueError, match="holds no grasp that can be read"):
         CalandraConfig(path=tmp_path, split="object").source()

@@ -183,6 +183,7 @@ def own_times(name: str, *lines: object) -> Callable[[Path], None]:
         (lambda root: os.mkfifo(root / "0/gel_timestamps.txt"), r"gel_timestamps\.txt is neither a file nor a folder"),
         (own_times("csv", "time", *[1.5] * 50), r"gel_timestamps\.csv: all 50 times are 1\.5 s: a clock that stands"),
         (spoil(stamp=lambda _: "0.3"), r"force\.csv, column stamp: all \d+ times are 0\.3 s: a clock that stands"),
+        (own_times("csv", *range(51)), r"gel_timestamps\.csv: unknown column 'time'"),
         (own_times("txt", *range(49)), r"gel_timestamps\.txt has 49 times, gel\.mp4 has 50 frames"),
         (
             lambda root: [own_times(kind, "time", *range(50))(root) for kind in ("txt", "csv")],

@@ -423,6 +423,7 @@ BAD: dict[str, tuple[Change | None, dict[str, Any], str]] = {
     "validation": (one(13, side="validation"), {"split": "side"}, r"unknown split in column 'side' 'validation': "),
     "control character": (one(13, object="a\x93"), {}, r"control character in a name, .*a\\x93"),
     "escape": (one(13, material="\x1b[2J"), {}, r"row 13, column 'material': control character in a name, .*x1b"),
+    "escape in a column": (each(**{"a\x1b": "b"}), {"labels": ("a\x1b",)}, r"in the name of column 'a.x1b'"),
     "leak of a touch": (each(seq=0), {"touch_group": "seq"}, r"1 of 1 touch groups are.*give the group"),
     "leak of an image": (each(vision="vision/00.png"), {}, r"1 of 1 vision images are in more than one split"),
     "nothing to train on": (each(side="test"), {"split": "side"}, r"'side' gives no rows of train"),

@@ -45,9 +45,7 @@ def times_of(video: Path) -> np.ndarray:
         stamps = seconds([line.strip() for line in file.read_text(errors="replace").splitlines() if line.strip()], file)
     else:
         table = read_manifest(file)
-        usual = next((name for name in STAMPS if name in table.columns), STAMPS[0])
-        column = table.columns[0] if len(table.columns) == 1 else usual
-        table.check(column)
+        table.check(column := next((name for name in STAMPS if name in table.columns), STAMPS[0]))
         stamps = seconds(table.filled(column, "time"), file)
     if len(stamps) != len(times):
         raise ValueError(f"{file} has {len(stamps)} times, {video.name} has {len(times)} frames")

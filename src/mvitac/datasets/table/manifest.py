@@ -84,6 +84,8 @@ class Manifest:
                 for name in {column, column.partition("[")[0]} & self.left_out.keys():
                     raise ValueError(f"{self.path}: {name} {self.left_out[name]}")
                 raise ValueError(f"{self.path}: {unknown('column', column, self.columns)}")
+            if CONTROL.search(json.dumps(column, ensure_ascii=False)):
+                raise ValueError(f"{self.path}: control character in the name of column {column!r}: rename it")
             cells = [row.get(column or "", "") for row in self.rows]
             if bad := {cell for cell in {*cells} if CONTROL.search(json.dumps(cell, ensure_ascii=False))}:
                 row, cell = next(each for each in zip(self.numbers, cells, strict=True) if each[1] in bad)
