@@ -114,7 +114,6 @@ def test_presses_cover_what_probes_need() -> None:
 
 
 def test_a_result_repeats(done: Path, small: Servo, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """And says how good each row is."""
     _, value = result.read_control(done)
     torch.manual_seed(7)  # whatever was drawn before
     _, again = result.read_control(result.run_suite([RANDOM.format(5)], small, tmp_path, About(name="five")))

@@ -145,7 +145,6 @@ def test_the_cache_knows_changed_files_of_the_same_size(tmp_path: Path) -> None:
 
 
 def test_a_repaired_image_has_another_stamp(tmp_path: Path) -> None:
-    """So that an unfinished pack is made again from there."""
     config = write_plain(tmp_path / "set", 200, 10)
     before = config.source().stamps()
     os.utime(tmp_path / "set" / "35.bmp", (20, 20))
@@ -533,7 +532,6 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
 
 
 def test_commands_say_what_a_group_is(tmp_path: Path, rows: Table, capsys: pytest.CaptureFixture[str]) -> None:
-    """And name an option as the command at hand writes it."""
     file = write(rows, tmp_path / "m.csv")
     words = ["data", "pack", "--data", "folder", "--path", str(file), "--size", "16", "--quiet", "--labels", "material"]
     assert main([*words, "--out", str(tmp_path / "grouped"), "--group", "object"]) == 0

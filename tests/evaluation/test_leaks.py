@@ -20,7 +20,7 @@ from mvitac.bench.external.adapters import said
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
-from mvitac.data.row_hashes import image_sums, known_images
+from mvitac.data.row_hashes import image_sums, known_images, split_leaks
 from mvitac.data.source import Sample
 from mvitac.data.spec import Window
 from mvitac.data.windows import windowed
@@ -206,6 +206,9 @@ def test_the_image_of_one_of_two_gels_is_a_leak(tmp_path: Path) -> None:
     for pack in (packs["b"], windowed(packs["b"], Window(frames=2))):
         assert Scored(pack).leak(seen, np.arange(4)).startswith("4 of 4 test rows and 0 of")
     assert Scored(packs["c"]).leak(seen, np.arange(4)) == ""
+    halves = with_columns(packs["a"], split=["train", "test"] * 2)  # of each press
+    assert split_leaks(halves, ())["split"].startswith("2 of 2 test presss are also in train")
+    assert "and images of 2 of 2 test rows are" in split_leaks(windowed(halves, Window(frames=2)), ())["split"]
     first, second = [source_of(packs["a"], np.array([0]))], np.array([1])  # the second frame's window shows the first
     assert Scored(packs["b"]).leak(first, second) == ""
     assert Scored(windowed(packs["b"], Window(frames=2))).leak(first, second).startswith("1 of 1 test rows")

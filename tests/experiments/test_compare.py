@@ -18,6 +18,7 @@ import pytest
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
+from mvitac.data.row_hashes import split_leaks
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import ON_VAL, PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
@@ -441,12 +442,12 @@ def test_a_leak_of_a_tasks_own_split_is_flagged(pack: Pack) -> None:
     pattern, bright = pack.spec.tasks
     own = with_columns(pack, split_bright=np.where(np.arange(pack.num) % 4 == 0, "test", "train"))
     task = replace(bright, split="split_bright")
-    said = own.split_leaks([pattern, task])
+    said = split_leaks(own, [pattern, task])
     assert said == {"split_bright": "30 of 30 test instances of bright are also in train: this split leaks"}
-    assert own.split_leaks([pattern]) == {}  # nothing that is scored
+    assert split_leaks(own, [pattern]) == {}  # nothing that is scored
     for side in ("train", "test"):  # without labels there
         labels = np.where(own.column("split_bright") == side, -1, own.labels("bright"))
-        assert with_columns(own, label_bright=labels).split_leaks([pattern, task]) == {}
+        assert split_leaks(with_columns(own, label_bright=labels), [pattern, task]) == {}
 
 
 def test_names_and_units_are_text_in_latex_and_markdown() -> None:

@@ -140,7 +140,6 @@ def test_killed_before_its_record_has_its_name(pack: Pack, smoke_run: Path, tmp_
 
 
 def test_temporary_files_of_others_stay(tmp_path: Path) -> None:
-    """Of a process that may still write, and of another file."""
     names = (f".a.{'0' * 32}.tmp", f".b.{'1' * 32}.tmp", "a.tmp")
     for name in names:
         (tmp_path / name).touch()

@@ -78,15 +78,12 @@ def measure(
     if (of := old["encoder"]["weights"]) != encoder["weights"]:
         raise ValueError(f"{path} is the result of other weights ({of[0][:12]}): give --name, or another --out")
     if old.get("suite_digest", suite.digest()) != suite.digest():
-        raise ValueError(
-            f"{path} is the result of another suite {suite.name!r}: rename the suite, or give another --out"
-        )
+        raise ValueError(f"{path} is the result of another suite {suite.name!r}: rename it, or give another --out")
     start = time.perf_counter()
     with hold_lock(path, f"another process writes {path}: wait for it, or give another --out", wait=False):
         found = score(models, encoder)
-        was, now = (
-            {(b["set"], b["task"]): b["data"] for b in one.get("blocks", ()) if "data" in b} for one in (old, found)
-        )
+        scored = ([b for b in one.get("blocks", ()) if "data" in b] for one in (old, found))
+        was, now = ({(b["set"], b["task"]): b["data"] for b in blocks} for blocks in scored)
         for key in (key for key in was if now.get(key) != was[key]):
             what = f"other data of {key[0]}" if key in now else f"{': '.join(key)}, which is not run now"
             raise ValueError(f"{path} is the result on {what}: move it, or give another --out")

@@ -15,6 +15,7 @@ from mvitac.cli.options import asks_help, check_json, parse, printed_to, save_js
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
+from mvitac.data.row_hashes import split_leaks
 from mvitac.data.spec import Task, Window, listed
 from mvitac.datasets.base import DatasetConfig, dataset
 from mvitac.datasets.mix import open_packs
@@ -65,7 +66,7 @@ def _groups(pack: Pack) -> str:
     about = f"groups: {len(sizes)}, one per {pack.spec.group_by}, of {rows} row{'s' * (rows != '1')} each. "
     if max(sizes) > 1 and len(np.unique(pack.touch_groups)) == len(sizes):
         about += "Each is one touch group, too: its rows may be each other's positives. "
-    leaks = "; ".join(pack.split_leaks(pack.spec.all_tasks).values())
+    leaks = "; ".join(split_leaks(pack, pack.spec.all_tasks).values())
     about += f"LEAK: {leaks}." if leaks else "A split takes whole groups, and intervals are over them."
     return fill(about, 80)
 

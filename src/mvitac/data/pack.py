@@ -170,20 +170,6 @@ class Pack:
             mask &= self.column(name).astype(str) == value
         return np.flatnonzero(mask)
 
-    def split_leaks(self, tasks: Sequence[AnyTask]) -> dict[str, str]:
-        """Column of each split that ``tasks`` use (or "split") -> how many of its test groups are in its train, if any."""
-        groups, said = self.column("group").astype(str), {}
-        for column in dict.fromkeys(task.split for task in tasks) or ("split",):
-            mine = [task for task in tasks if task.split == column != "split"]
-            own = f" of {' and '.join(task.name for task in mine)}" if mine else ""
-            asked = np.any([self.answered(task) for task in mine] or [np.ones(self.num, bool)], axis=0)
-            of = (self.rows(split, by=column) for split in ("train", "test"))
-            train, test = ({*groups[rows[asked[rows]]]} for rows in of)
-            if both := len(train & test):
-                how = f"{both} of {len(test)} test {self.spec.group_by}s{own}"
-                said[column] = f"{how} are also in train: this split leaks"
-        return said
-
     def with_splits(self, splits: "Mapping[str, Iterable[str]]") -> "Pack":
         """This pack with other cells in columns of splits."""
         made = copy.copy(self)

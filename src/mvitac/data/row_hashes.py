@@ -2,12 +2,13 @@
 
 import hashlib
 import zlib
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.special import gammainc
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import MODALITIES
+from mvitac.data.spec import MODALITIES, AnyTask
 
 IMAGES = *((m, slice(None)) for m in MODALITIES), ("touch", slice(3)), ("touch", slice(3, 6))
 """Modality and channels of what ``image_sums`` compares: the last two are each of two touch sensors."""
@@ -81,6 +82,30 @@ def known_images(pack: Pack, rows: np.ndarray, known: np.ndarray) -> np.ndarray:
             same[:, place] = False
     where = enumerate(shown(pack, rows))
     return np.stack([same[np.searchsorted(every, at), place].any(axis=1) for place, at in where], axis=1)
+
+
+def shown_sums(pack: Pack, rows: np.ndarray) -> np.ndarray:
+    """``image_sums`` of all images that ``rows`` show, each once."""
+    sums = image_sums(pack)
+    found = np.unique(np.concatenate([sums[at, place].ravel() for place, at in enumerate(shown(pack, rows))]))
+    return found[found > 0]
+
+
+def split_leaks(pack: Pack, tasks: Sequence[AnyTask]) -> dict[str, str]:
+    """Column of each split that ``tasks`` use (or "split") -> how much of its test is in its train, if anything is."""
+    groups, said = pack.column("group").astype(str), {}
+    for column in dict.fromkeys(task.split for task in tasks) or ("split",):
+        mine = [task for task in tasks if task.split == column != "split"]
+        own = f" of {' and '.join(task.name for task in mine)}" if mine else ""
+        asked = np.any([pack.answered(task) for task in mine] or [np.ones(pack.num, bool)], axis=0)
+        train, test = (rows[asked[rows]] for rows in (pack.rows(split, by=column) for split in ("train", "test")))
+        names, copied = {*groups[test]}, known_images(pack, test, shown_sums(pack, train)).any(axis=1)
+        num, by = len(names & {*groups[train]}), pack.spec.group_by
+        found = [f"{num} of {len(names)} test {by}s{own}"] * bool(num)
+        found += [f"images of {copied.sum()} of {len(test)} test rows{own}"] * bool(copied.any())
+        if found:
+            said[column] = f"{' and '.join(found)} are also in train: this split leaks"
+    return said
 
 
 def _hash(texts: np.ndarray, name: str, weak: bool) -> np.ndarray:

@@ -31,14 +31,12 @@ def in_order(names: Iterable[str]) -> list[str]:
 
 
 def stamped(names: Sequence[str]) -> np.ndarray | None:
-    """Return the times [N] in seconds of images named by stamps since 1970; None of other names, as of those that count.
-
-    ValueError if most are stamps, but not all.
-    """
+    """Times [N] in seconds of images named by stamps since 1970; None of other names. ValueError if only most are stamps."""
     other = [name for name in names if (number_of(name) or 0) <= 1e9]
     if other and 2 * len(other) < len(names):
         raise ValueError(f"image {other[0]!r} has no time in its name, as the others have: take it away")
-    return None if other else seconds(names, "names")
+    times = np.zeros(1) if other else seconds(names, "names")
+    return times if times.min() > 1e9 else None
 
 
 def seconds(cells: Iterable[str], where: object) -> np.ndarray:

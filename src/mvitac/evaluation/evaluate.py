@@ -301,7 +301,7 @@ def check_unseen(
         for task in tasks if refused else ():
             if (leak := scored.leak(refused, split_rows(pack, task).test)) not in ("", UNKNOWN):
                 seen = f"{path} has seen what {pack.path} would score, task {task.name!r}: {leak}"
-                raise ValueError(f"{seen}; give a pack of other test groups, or --allow-leak (report has none)")
+                raise ValueError(f"{seen}; give a pack of other test groups, or --allow-leak, if the command has it")
     return sources
 
 

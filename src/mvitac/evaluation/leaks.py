@@ -19,7 +19,7 @@ import safetensors
 import safetensors.numpy
 
 from mvitac.data.pack import Pack
-from mvitac.data.row_hashes import image_sums, known_images, row_hashes, shown
+from mvitac.data.row_hashes import known_images, row_hashes, shown_sums, split_leaks
 from mvitac.data.spec import MODALITIES
 from mvitac.nn.encoders import IMAGENET, SCRATCH
 from mvitac.nn.weights import said_trained_on
@@ -46,9 +46,8 @@ class Source:
 
 def source_of(pack: Pack, rows: np.ndarray, what: str = "") -> Source:
     """The source that pack ``rows`` are; ``what`` ends its name."""
-    (ids, groups), sums = (np.unique(found[rows]) for found in row_hashes(pack)), image_sums(pack)
-    images = np.unique(np.concatenate([sums[at, place].ravel() for place, at in enumerate(shown(pack, rows))]))
-    return Source(pack.spec.name + what, ids, groups, images[images > 0])
+    ids, groups = (np.unique(found[rows]) for found in row_hashes(pack))
+    return Source(pack.spec.name + what, ids, groups, shown_sums(pack, rows))
 
 
 def unknown_source(name: str) -> Source:
@@ -174,8 +173,8 @@ def leaks_of(records: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def mark_split_leaks(pack: Pack, records: Sequence[dict[str, Any]]) -> list[str]:
-    """A line for each split with groups in train and in test. Marks ``records`` of it, controls too: they gain alike."""
-    columns, found = {task.name: task.split for task in pack.spec.all_tasks}, pack.split_leaks(pack.spec.all_tasks)
+    """A line for each split of which test is in train, too. Marks ``records`` of it, controls too: they gain alike."""
+    columns, found = {task.name: task.split for task in pack.spec.all_tasks}, split_leaks(pack, pack.spec.all_tasks)
     said = {}
     for record in records:
         if text := found.get(columns.get(record.get("task", ""), "split")):

@@ -171,10 +171,7 @@ def per_class(records: Sequence[dict[str, Any]], classes: Mapping[str, Sequence[
 
 
 def summarise_again(records: Sequence[dict[str, Any]], probe: str) -> dict[str, Any]:
-    """``summarise`` by a further probe, without the tasks that have none of this kind: of values, the paper's.
-
-    "own", the head that was trained with its encoders, has no other rows than those of this kind.
-    """
+    """``summarise`` by a further probe, of the tasks that have it. "own", a head trained with its encoders, stands alone."""
     tasks = {record["task"] for record in records if record["probe"] == probe}
     kept = (r for r in records if probe != "own" or r["probe"] == probe)
     return summarise([record for record in kept if record["task"] in tasks], probe)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from mvitac.data.pack import Pack
+from mvitac.data.row_hashes import split_leaks
 from mvitac.evaluation.controls import Records, controls_of, frozen_trunks
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
 from mvitac.evaluation.probe import split_rows
@@ -116,7 +117,7 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
             *(" ".join(note.split()) for note in work.pack.spec.notes),
             *(f"{label} reads other images than the controls" for label in work.other_images),
         ],
-        "leaks": "; ".join(work.pack.split_leaks(chosen(work.pack, session)[0]).values()),
+        "leaks": "; ".join(split_leaks(work.pack, chosen(work.pack, session)[0]).values()),
         "records": [record for records, _ in scored for record in records] + controls,
         "retrieval": [record for _, retrieval in scored for record in retrieval] + found,
         "rows": [row.label for row in work.plan.rows if row.label not in work.left_out],

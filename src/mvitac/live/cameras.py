@@ -131,8 +131,9 @@ def start_together(files: Sequence[Recording]) -> None:
     if late.times[0] > early.times[-1] + TOGETHER:
         ends = f"{early.path} ends at {early.times[-1]:.2f} s, {late.path} begins at {late.times[0]:.2f} s"
         raise ValueError(f"{ends}: give recordings of the same time, or FOLDER@FPS to pass over names that are times")
+    begin = min(float(file.times[0]) for file in files)
     for file in files:
-        file.begin = float(min(file.times[0] for file in files))
+        file.begin = begin
 
 
 class Video(Recording):
@@ -195,7 +196,7 @@ class Simulated(Source):
         self.noise = np.random.default_rng([self.seed, self.modality == "touch"])
 
     def wait(self, elapsed: float) -> float:
-        return 1 / self.fps
+        return 1 / self.fps - elapsed % (1 / self.fps)
 
     def read(self) -> np.ndarray:
         from mvitac.sim import gel, materials

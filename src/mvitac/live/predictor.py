@@ -80,8 +80,7 @@ class Live:
             always: predict from every frame; without contact, an answer is that of its frame alone.
 
         Raises:
-            ValueError: the engine takes other inputs, or other backgrounds subtracted than those that can be learned live;
-                recordings are not of the same time.
+            ValueError: the engine takes other inputs, or backgrounds that live cannot learn; recordings of other times.
         """
         given = {m: len(several) for m, several in streams.items()}
         if given != (wanted := {m: shape[2] // 3 for m, shape in frame_shapes(engine).items()}):

@@ -73,10 +73,7 @@ def check_ordinary(path: Path) -> None:
 
 
 def walk(folder: Path) -> Iterator[Path]:
-    """Every path below ``folder``, but for those in hidden folders; OSError if a folder cannot be read.
-
-    ``Path.rglob`` leaves such a folder out without a word.
-    """
+    """Every path below ``folder``, hidden folders not entered; OSError if one cannot be read: ``rglob`` says nothing."""
 
     def stop(error: OSError) -> None:
         raise error
