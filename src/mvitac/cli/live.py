@@ -221,8 +221,8 @@ def predict(argv: list[str]) -> None:
     finally:  # also where no frame is left
         for text, first in [*recordings.told.items()][:9]:
             _say(f"from frame {first}: {text}")
-    if num := recordings.left_out:
-        _say(f"{num} frames are left out: damaged, or without a frame of the other recording within {TOGETHER} s")
+        if num := recordings.left_out:
+            _say(f"{num} frames are left out: damaged, or without a frame of the other recording within {TOGETHER} s")
     if "touch" in opened and not recordings.calibrated:
         _say(f"contact is not known: no {options.live.calibration} frames without it, and no --background")
 
