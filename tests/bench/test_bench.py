@@ -681,6 +681,7 @@ def test_shipped_suites_keep_their_definitions() -> None:
         (SUITE.replace("folds = 3", "folds = -3"), "folds -3: give 2 or more"),
         (SUITE.replace('probes = ["linear"]', 'probes = ["paper"]'), "needs linear or knn"),
         (SUITE.replace("labels = [0.3]", "labels = [nan]"), "task 'pattern': labels nan: give fractions above 0"),
+        (SUITE.replace("labels = [0.3]", "labels = [0.3, 0.30000001]"), "nothing twice"),
     ],
 )
 def test_suites_that_are_wrong(text: str, expected: str, tmp_path: Path) -> None:

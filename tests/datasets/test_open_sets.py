@@ -176,13 +176,16 @@ def test_slip_grasp_labels_no_late_frame_where_early_ones_are_lost(tmp_path: Pat
             path.unlink()
     rows = [row for row in SlipGraspConfig(path=tmp_path).manifest().rows if row["object"] == "001"]
     assert len(rows) == 3 * 15 and {int(row["seq"]) for row in rows} == {*range(6, 21)}
-    whole = (file := tmp_path / "data/object001_result.dat").read_text()
-    file.write_text(whole.replace(" 040_0", " ../object002/041_0"))
-    with pytest.raises(ValueError, match=r"line 1: .* is not a grasp of eight words"):
-        SlipGraspConfig(path=tmp_path).manifest()
-    file.write_bytes(b"\xff\xfe 1 0 1 2 x y z")
-    with pytest.raises(ValueError, match=r"object001_result.dat line 1: .* is not a grasp of eight words"):
-        SlipGraspConfig(path=tmp_path).manifest()
+    whole = (file := tmp_path / "data/object001_result.dat").read_bytes()
+    for old, new, says in (
+        (b" 040_0", b" ../object002/041_0", "is not a grasp of eight words"),
+        (whole, b"\xff\xfe 1 0 1 2 x y z", "is not a grasp of eight words"),
+        (b" 1000 ", b" 1007 ", "frames 1001 to 1015 .* not 5 before key frame 1007 "),
+        (b" 1000 ", b" 999 ", "frames 1001 to 1015 .* not 5 before key frame 999 "),
+    ):
+        file.write_bytes(whole.replace(old, new))
+        with pytest.raises(ValueError, match=f"object001_result.dat line 1: .*{says}"):
+            SlipGraspConfig(path=tmp_path).manifest()
     file.unlink()
     (note,) = SlipGraspConfig(path=tmp_path).source().spec().notes
     assert note == "object001 is left out: object001_result.dat says nothing of it"

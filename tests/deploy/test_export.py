@@ -95,8 +95,8 @@ def test_a_check_that_checks_nothing_is_refused(wrong: dict[str, Any]) -> None:
 
 def test_an_unknown_runtime_is_refused(onnx: Path) -> None:
     wrong: Any = {"engine": "torchscript"}
-    for given in (wrong, {"threads": -1}, {"threads": "2"}, {"threads": 1.5}):
-        with pytest.raises(ValueError, match="give one of auto, onnxruntime, openvino, and 0 or more"):
+    for given in (wrong, {"threads": -1}, {"threads": 2**31}, {"threads": "2"}, {"threads": 1.5}):
+        with pytest.raises(ValueError, match="give one of auto, onnxruntime, openvino, and 0 to 1024"):
             Engine(onnx, **given)
 
 

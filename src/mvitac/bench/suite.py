@@ -20,6 +20,7 @@ from mvitac.data.spec import AnyTask, DataSpec, Task
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.simulated import SimulatedConfig
 from mvitac.datasets.table.splits import folds
+from mvitac.evaluation import few_labels
 from mvitac.evaluation.probe import VALUE_PROBES
 from mvitac.evaluation.probe_config import Probe
 from mvitac.registry import check_known, from_json, to_json, unknown
@@ -41,7 +42,8 @@ class SuiteTask:
         for share in self.labels:
             if not 0 < share < 1:
                 raise ValueError(f"task {self.name!r}: labels {share}: give fractions above 0 and below 1")
-        if not self.modalities or len({*self.modalities, *self.labels}) < len((*self.modalities, *self.labels)):
+        given = (*self.modalities, *(few_labels.name(100 * share) for share in self.labels))
+        if not self.modalities or len({*given}) < len(given):
             raise ValueError(f"task {self.name!r}: give touch, vision or both, and nothing twice")
 
 

@@ -70,6 +70,9 @@ def _grasps(root: Path, file: Path) -> list[dict[str, str]]:
                 pairs[int(found[2])][modality] = path.relative_to(root).as_posix()
         if not pairs:
             raise ValueError(f"{file} line {number}: no images in object{name}/{folder}_mm: clone it whole")
+        if not int(key) - 5 <= min(pairs) <= max(pairs) <= int(key) + 15:  # else late frames would count as early ones
+            shown = f"frames {min(pairs)} to {max(pairs)} of {folder}_mm"
+            raise ValueError(f"{file} line {number}: {shown} are not 5 before key frame {key} to 15 after it")
         grasp = f"{name}_{folder}"
         widths[grasp] = float(width)
         for frame, images in sorted(pairs.items()):

@@ -163,9 +163,9 @@ def spread_at(target: Mapping[str, Any], value: float) -> float:
 
 def open_model(path: Path, engine: Runtime = "auto", precision: str = "fp32", threads: int = 0) -> Call:
     """An ONNX file as a function from input arrays to output arrays. Only OpenVINO computes in bf16."""
-    if engine not in get_args(Runtime) or type(threads) is not int or threads < 0:
+    if engine not in get_args(Runtime) or type(threads) is not int or not 0 <= threads <= 1024:
         known = ", ".join(get_args(Runtime))
-        raise ValueError(f"engine {engine!r}, threads {threads}: give one of {known}, and 0 or more")
+        raise ValueError(f"engine {engine!r}, threads {threads}: give one of {known}, and 0 to 1024")
     if engine == "auto":
         wanted = importlib.util.find_spec("openvino") and (precision != "int8" or _has_vnni())
         engine = "openvino" if wanted else "onnxruntime"

@@ -35,7 +35,7 @@ class ProbeConfig:
     that it has, and take the mean features. Retrieval stays as it is."""
 
     def __post_init__(self) -> None:
-        given = {"probe": self.probes, "task": self.tasks, "modality": self.modalities, "standardise": self.standardise}
+        given = {"probe": self.kinds, "task": self.tasks, "modality": self.modalities, "standardise": self.standardise}
         for name, values in given.items():
             for value in values:
                 if values.count(value) > 1:

@@ -65,7 +65,8 @@ def pack_tables(engine: Engine, pack: Pack, about: Sequence[str] = ("group", "sp
             what = f"{pack.path} has images of {modality} of {have}, the model takes {takes}"
             raise ValueError(f"{what}: name all its sensors (--{modality}), pack with --size {takes[0]}")
     if pack.spec.difference != engine.difference:
-        raise ValueError(f"{pack.path}: touch minus its background, in the model or in the pack only")
+        where = "the pack" if pack.spec.difference else "the model"
+        raise ValueError(f"{pack.path}: touch minus its background in {where} only: give recordings and --background")
     if engine.window:
         pack = windowed(pack, from_json(Window, {k: v for k, v in engine.window.items() if k != "layout"}))
     rows = np.flatnonzero(np.logical_and.reduce([pack.has(m) for m in engine.inputs]))
