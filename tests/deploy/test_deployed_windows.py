@@ -166,5 +166,4 @@ def test_exported_windows(published: Path, measured: Pack, tmp_path: Path, capsy
     command = ["live", str(out), *film(measured, tmp_path, rest=4, num=10, fps=30)]
     capsys.readouterr()
     assert main([*command, "--calibration", "2", "--stale", "60"]) == 0
-    said = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert said[0]["both"]["level"]["unit"] == "levels"
+    assert next(json.loads(line) for line in capsys.readouterr().out.splitlines())["both"]["level"]["unit"] == "levels"

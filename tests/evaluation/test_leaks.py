@@ -222,8 +222,7 @@ def test_equal_checksums_by_chance_are_no_leak(pack: Pack) -> None:
     one = sums[rows[:1], 1]  # of touch
     some = known_images(pack, rows, one)
     assert some.sum() == 1 and some[0, 1]
-    others = (1 << 33) + np.arange(1 << 18, dtype=np.uint64)
-    assert not known_images(pack, rows, np.concatenate([one, others])).any()
+    assert not known_images(pack, rows, np.concatenate([one, (1 << 33) + np.arange(1 << 18, dtype=np.uint64)])).any()
 
 
 def test_data_changed_since_training_is_said(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -61,8 +61,7 @@ def features_that_know(pack: Pack, how_well: float = 3.0) -> np.ndarray:
     """Features of the first task's (train, val, test) rows in which the label is a direction plus noise."""
     task = pack.spec.tasks[0]
     labels = pack.column(f"label_{task.name}")[split_rows(pack, task).all]
-    rng = np.random.default_rng(0)
-    return (np.eye(8)[labels] * how_well + rng.normal(0, 0.3, (len(labels), 8))).astype(np.float32)
+    return (np.eye(8)[labels] * how_well + np.random.default_rng(0).normal(0, 0.3, (len(labels), 8))).astype(np.float32)
 
 
 def test_the_papers_probe_learns_and_repeats() -> None:
@@ -345,8 +344,9 @@ def test_a_thumbnail_is_the_mean_of_its_pixels_and_the_border_sees_nothing_of_th
 
     image = np.random.default_rng(0).integers(0, 255, (32, 32, 6), np.uint8)
     found = controls.thumbnails(pictures(image), "touch", np.array([0]), side=8)
-    blocks = image.reshape(8, 4, 8, 4, 6).mean((1, 3)) / 255
-    assert np.allclose(found[0], blocks.transpose(2, 0, 1).ravel(), atol=1e-6)
+    assert np.allclose(
+        found[0], (image.reshape(8, 4, 8, 4, 6).mean((1, 3)) / 255).transpose(2, 0, 1).ravel(), atol=1e-6
+    )
     plain = np.full((32, 32, 3), 7, np.uint8)
     middle, edge = plain.copy(), plain.copy()
     middle[4:-4, 4:-4] = 200

@@ -473,8 +473,7 @@ def test_a_run_is_exported_again_for_other_data(
     monkeypatch.setattr("mvitac.deploy.publish.with_probes", lambda model, data: model)
     monkeypatch.setenv("MVITAC_CACHE", str(tmp_path / "cache"))
     other = SimpleNamespace(digest="0" * 64, spec=pack.spec)
-    unit = SimpleNamespace(digest=pack.digest, spec=replace(pack.spec, notes=("in mN",)))
-    for data in (pack, other, unit, pack):
+    for data in (pack, other, SimpleNamespace(digest=pack.digest, spec=replace(pack.spec, notes=("in mN",))), pack):
         monkeypatch.setattr("mvitac.deploy.publish.own_data", lambda *_, data=data, **__: data)
         _engine(str(smoke_run), 1)
     assert len(made) == 3

@@ -19,8 +19,7 @@ def stamped(time: float) -> Any:
 def raw(time: float, pixels: np.ndarray, encoding: str) -> Any:
     lines = np.pad(pixels.reshape(pixels.shape[0], -1).view(np.uint8), ((0, 0), (0, 4)))
     shape = {"height": pixels.shape[0], "width": pixels.shape[1], "encoding": encoding, "is_bigendian": 0}
-    kind = STORE.types["sensor_msgs/msg/Image"]
-    return kind(header=stamped(time), **shape, step=lines.shape[1], data=lines.ravel())
+    return STORE.types["sensor_msgs/msg/Image"](header=stamped(time), **shape, step=lines.shape[1], data=lines.ravel())
 
 
 def compressed(time: float, pixels: np.ndarray) -> Any:

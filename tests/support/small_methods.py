@@ -50,6 +50,5 @@ def slow_info_nce(query: torch.Tensor, key: torch.Tensor, tau: float) -> float:
         q = query[i].double() / query[i].double().norm()
         ks = [k.double() / k.double().norm() for k in key]
         numerator = math.exp(float(q @ ks[i]) / tau)
-        denominator = sum(math.exp(float(q @ k) / tau) for k in ks)
-        total += -math.log(numerator / denominator)
+        total += -math.log(numerator / sum(math.exp(float(q @ k) / tau) for k in ks))
     return total / len(query)

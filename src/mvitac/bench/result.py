@@ -75,8 +75,7 @@ def sign(
 def write_result(path: Path, value: dict[str, Any]) -> None:
     """Write a result, one line for each of its fields."""
     lines = (f"{json.dumps(k)}: {json.dumps(v, separators=(',', ':'), allow_nan=False)}" for k, v in value.items())
-    text = "{\n" + ",\n".join(lines) + "\n}\n"
-    write_atomic(path, lambda file: file.write(text.encode()))
+    write_atomic(path, lambda file: file.write(("{\n" + ",\n".join(lines) + "\n}\n").encode()))
 
 
 def read_signed(path: Path, form: tuple[str, int] = FORM) -> dict[str, Any]:

@@ -219,8 +219,7 @@ def _fold(pack: Pack, one: SuiteSet) -> tuple[Pack, ...]:
     """One view of ``pack`` per fold of its groups. Groups without any answer are "unlabelled"."""
     tasks = {task.name: task for task in pack.spec.all_tasks}
     groups = pack.column("group").astype(str)
-    answered = np.any([pack.answered(tasks[asked.name]) for asked in one.tasks], axis=0)
-    kept = sorted(set(groups[answered].tolist()))
+    kept = sorted(set(groups[np.any([pack.answered(tasks[asked.name]) for asked in one.tasks], axis=0)].tolist()))
     if one.folds > len(kept):
         raise ValueError(f"{one.name} has {len(kept)} labelled groups, the suite asks for {one.folds} folds")
     first, strata = tasks[one.tasks[0].name], [""] * len(kept)

@@ -98,8 +98,7 @@ def fit_linear(
     # C ascends and each fit starts from the last one: about a third of the steps of cold starts.
     model = LogisticRegression(max_iter=300, tol=1e-3, warm_start=True)
     with one_blas_thread():
-        scores = [model.set_params(C=c).fit(x, y).score(x_val, y_val) for c in STRENGTHS]
-        c = STRENGTHS[int(np.argmax(scores))]
+        c = STRENGTHS[int(np.argmax([model.set_params(C=c).fit(x, y).score(x_val, y_val) for c in STRENGTHS]))]
         if set(y_val) - set(y):  # a class seen only in val changes the shape of the weights
             model = LogisticRegression(max_iter=300, tol=1e-3)
         model.set_params(C=c).fit(np.concatenate([x, x_val]), np.concatenate([y, y_val]))

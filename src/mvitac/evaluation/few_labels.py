@@ -38,7 +38,6 @@ def few(
         order = rng.permutation(len(rows))
         _, first = np.unique(strata[rows[order]], return_index=True)  # one of each class, then any
         rest = np.setdiff1d(np.arange(len(rows)), first)
-        wanted = max(len(first), round(share * len(rows)))
-        return np.sort(order[np.concatenate([first, rest])[:wanted]])
+        return np.sort(order[np.concatenate([first, rest])[: max(len(first), round(share * len(rows)))]])
 
     return some(train), some(val)

@@ -24,8 +24,7 @@ def fold_splits(pack: Pack, task: AnyTask, num: int, learned: Sequence[Source]) 
     ids, names = row_hashes(pack)
     of = {key: np.concatenate([np.zeros(0, np.uint64), *(getattr(source, key) for source in learned)]) for key in KEYS}
     copied = np.isin(ids, of["ids"]) | known_images(pack, np.arange(pack.num), of["images"]).any(axis=1)
-    seen = np.isin(names, np.concatenate([of["groups"], names[copied]]))
-    rows = np.flatnonzero(known & ~seen)
+    rows = np.flatnonzero(known & ~np.isin(names, np.concatenate([of["groups"], names[copied]])))
     groups = pack.column("group")[rows].astype(str)
     if (left := len(set(groups))) < num:
         free = f"{left} {pack.spec.group_by}s that no run learned from"

@@ -107,8 +107,7 @@ def finetune(
         raise ValueError(f"{both}: --labels is for tasks with classes, --values for those with values")
     names = (*asked.labels, *asked.values) or tuple(task.name for task in pack.spec.tasks or pack.spec.values)
     tasks = tuple(chosen(pack, ProbeConfig(tasks=names))[0])
-    fitted = fitting(model, pack, asked.modalities or MODALITIES)
-    modalities: Any = asked.modalities or fitted
+    modalities: Any = asked.modalities or fitting(model, pack, asked.modalities or MODALITIES)
     method = SupervisedConfig(tasks=tuple(task.name for task in tasks), modalities=modalities)
     modality = "both" if len(modalities) == 2 else modalities[0]
     job = _Job(asked, model, pack, _run_of(model, init, data, pack, method), tasks, modality, out, say, quiet)

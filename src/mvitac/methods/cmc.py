@@ -59,8 +59,7 @@ def nce(scores: Float[Tensor, "B _"], noise: float) -> Float[Tensor, ""]:
     """NCE loss of normalised scores s, whose column 0 is the positive's. ``noise`` is K / N: K times the uniform density."""
     positive, negatives = scores[:, 0], scores[:, 1:]
     accepted = torch.log(positive / (positive + noise + EPS))
-    rejected = torch.log(noise / (negatives + noise + EPS))
-    return -(accepted + rejected.sum(1)).mean()
+    return -(accepted + torch.log(noise / (negatives + noise + EPS)).sum(1)).mean()
 
 
 class CMC(Contrastive, config=CMCConfig):

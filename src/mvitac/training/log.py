@@ -35,8 +35,7 @@ class Log:
         self.path = out / "log.jsonl"
         kept = [entry for entry in read_log(out) if entry["step"] <= start] if start else []
         self.first = next((entry["eval"] for entry in kept if entry["step"] == 0 and "eval" in entry), {})
-        text = "".join(json.dumps(entry) + "\n" for entry in kept)
-        write_atomic(self.path, lambda file: file.write(text.encode()))
+        write_atomic(self.path, lambda file: file.write("".join(json.dumps(entry) + "\n" for entry in kept).encode()))
         self.file = self.path.open("a")
         self.loggers, self.start, self.since, self.since_step = loggers, start, time.perf_counter(), start
         self.num_steps, self.batch_size, self.quiet, self.stack = num_steps, run.batch_size, quiet, ExitStack()

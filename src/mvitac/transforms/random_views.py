@@ -110,8 +110,7 @@ def draw(config: ViewAugment, num: int, size: int, generator: torch.Generator) -
     height, width = height.gather(1, first).squeeze(1), width.gather(1, first).squeeze(1)
     height[none] = width[none] = size
     top = (uniform(num) * (size - height + 1)).long()
-    left = (uniform(num) * (size - width + 1)).long()
-    boxes = torch.stack([top, left, height, width], dim=1)
+    boxes = torch.stack([top, (uniform(num) * (size - width + 1)).long(), height, width], dim=1)
     flip, grayscale = uniform(num) < config.flip, uniform(num) < config.grayscale
     return Drawn(boxes, flip, grayscale, uniform(num, 5, low=1 - config.jitter, high=1 + config.jitter))
 
