@@ -4,7 +4,8 @@
     python examples/one_encoder.py MANIFESTS OUT [--seeds 1] [--rows joint "simulation" ...] [--steps 5400]
 
 Three folds of objects of every set. The encoder of a fold is pre-trained on simulated materials and on the training rows of
-all sets in that fold, so it has seen no object that it is tested on. A stopped script continues where it was.
+all sets in that fold, so it has seen no object that it is tested on. A stopped script continues where it was; OUT holds
+the scores of one number of steps and one set of manifests.
 """
 
 from __future__ import annotations
@@ -33,9 +34,10 @@ from mvitac.evaluation.score_text import percent, with_interval
 from mvitac.evaluation.scores import pool
 from mvitac.model import Model, fresh
 from mvitac.recipes import recipe
-from mvitac.system.files import read_json, write_json
+from mvitac.system.files import digest_file, read_json, write_json
 
 FOLDS, SIDE = 3, 72
+ROWS = ("simulation", "joint", "real", "in place", "joint then in place")  # methods of ``Encoders``
 TARGETS = "pose=pose_z_mm:mm,pose_Rx_deg:deg,pose_Ry_deg:deg,shear_x_mm:mm,shear_y_mm:mm,shear_Rz_deg:deg"
 LABELS = ("material", "hardness", "roughness", "bumpiness")
 SETS: dict[
@@ -222,18 +224,25 @@ def main() -> None:
     parser.add_argument("manifests", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--seeds", type=int, default=1, help="seeds of every row, from 0 on")
-    parser.add_argument("--rows", nargs="+", default=["simulation", "joint", "in place"])
+    parser.add_argument("--rows", nargs="+", default=["simulation", "joint", "in place"], choices=ROWS)
     parser.add_argument("--sets", nargs="+", default=list(SETS), choices=list(SETS))
     parser.add_argument("--steps", type=int, default=1350, help="steps of rows that are trained on several sets")
     parser.add_argument("--own-steps", type=int, default=300, help="steps of rows that are trained on one set")
     args = parser.parse_args()
     if not args.manifests.is_dir():
         parser.error(f"{args.manifests} is not there: write the manifests by examples/real_manifests.py")
+    files = {file.stem: digest_file(file) for file in sorted(args.manifests.glob("*.csv"))}
+    asked = {"steps": args.steps, "own_steps": args.own_steps, "manifests": files}
+    if (known := args.out / "asked.json").exists() and read_json(known, "settings") != asked:
+        parser.error(f"{args.out} holds runs of other steps or manifests ({known.name}): give another OUT")
+    args.out.mkdir(parents=True, exist_ok=True)
+    write_json(known, asked)
     if not (args.out / "packs" / "sim").exists():
         data = recipe("quick").data
         build(data.source(), args.out / "packs" / "sim", size=data.size)
     encoders, file = Encoders(args.manifests, args.out, args.steps, args.own_steps), args.out / "scores.json"
     kept: dict[str, list[dict[str, Any]]] = read_json(file, "scores") if file.exists() else {}
+    shown: dict[str, list[dict[str, Any]]] = {}
     for seed in range(args.seeds):
         for source in ["untrained", *(["pixels"] if not seed else []), *args.rows]:
             for name in args.sets:
@@ -241,7 +250,8 @@ def main() -> None:
                     kept[key] = score(source, None if source == "pixels" else seed, name, encoders)
                     write_json(file, kept)
                     print(key, *(f"{r['task']} {r['modality']} {percent(lead(r))}" for r in kept[key]), flush=True)
-    show(kept)
+                shown[key] = kept[key]
+    show(shown)
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from mvitac.evaluation.score_text import percent, with_interval
 from mvitac.evaluation.scores import pool
 from mvitac.model import fresh
 from mvitac.recipes import recipe
-from mvitac.system.files import read_json, write_json
+from mvitac.system.files import digest_file, read_json, write_json
 
 SETS: dict[str, dict[str, Any]] = {
     "slip_gsmini": {
@@ -156,9 +156,12 @@ def main(manifests: Path, name: str, out: Path) -> None:
     shared: dict[str, Any] = {"path": manifests / f"{name}.csv", "vision": "", "group": "object", "size": 72}
     config = FolderConfig(**shared, **about["options"], title=name)
     kept: dict[str, list[dict[str, Any]]] = read_json(out, "scores") if out.exists() else {}
+    of = f"{name} {digest_file(shared['path'])[:12]}: "
+    if other := [key for key in kept if not key.startswith(of)]:
+        sys.exit(f"{out} holds scores of another set or manifest ({other[0]}): give another file")
 
     def score(source: str, seed: int | None, features: Any) -> None:
-        if (key := f"{source} seed {seed}") in kept:
+        if (key := f"{of}{source} seed {seed}") in kept:
             return
         pack, x = features()
         kept[key] = scored(pack, about["folds"], {"source": source, "seed": seed}, x)

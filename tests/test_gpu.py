@@ -35,8 +35,7 @@ def commands(monkeypatch):
 @pytest.mark.slow
 def test_a_rehearsal_measures_all_and_goes_on_elsewhere(commands, tmp_path, monkeypatch):
     def call(out: str, work: str, *more: str) -> dict[str, Any]:
-        folders = ["--out", str(tmp_path / out), "--work", str(tmp_path / work)]
-        gpu.main(["--smoke", "--device", "cpu", *folders, *more])
+        gpu.main(["--smoke", "--device", "cpu", "--out", str(tmp_path / out), "--work", str(tmp_path / work), *more])
         return json.loads((tmp_path / out / "gpu.json").read_text())
 
     monkeypatch.setattr(floor, "best", partial(floor.best, num=1))  # bf16 is slow where a CPU has none

@@ -194,8 +194,7 @@ class Run:
         for name in NOT_IN_DIGEST:
             del value[name]
         # Options that do not change the outcome: local ones, and how raw pixels would be compressed.
-        idle = (*self.data.local, "store", "quality") if self.data.store == "raw" else self.data.local
-        for name in idle:
+        for name in (*self.data.local, "store", "quality") if self.data.store == "raw" else self.data.local:
             del value["data"][name]
         return digest(value)
 

@@ -218,8 +218,7 @@ def test_imagenet_is_a_control_where_its_weights_are(
     toys = find_suite(str(root / "toys.toml"))
     run_bench([RANDOM.format(5)], toys, tmp_path / "without", root, About())
     assert "without the control imagenet: ImageNet weights of resnet18" in capsys.readouterr().err
-    known = {toys.imagenet: RANDOM.format(9)}
-    monkeypatch.setattr(score, "open_model", lambda text: open_model(known.get(text, text)))
+    monkeypatch.setattr(score, "open_model", lambda text: open_model({toys.imagenet: RANDOM.format(9)}.get(text, text)))
     value = read_result(run_bench([RANDOM.format(5)], toys, tmp_path / "with", root, About()))
     found = {(r["modality"], r["probe"], r["seed"]) for r in value["blocks"][0]["records"] if r["source"] == "imagenet"}
     assert found == {(m, p, None) for m in ("touch", "both") for p in ("linear", "30 % of labels")}
@@ -459,7 +458,7 @@ FORGED: dict[str, tuple[Change, str]] = {
     "other control": (put(*RECORDS, value=lambda all: [*all, {**all[0], "source": "mine"}]), "has too much of mine"),
     "task": (lambda value: value["blocks"].pop(3), "the suite asks for"),
     "same name": (put("encoder", "name", value=" Untrained"), "the name of a control, ' Untrained'"),
-    "no name": (put("encoder", "name", value=" "), "has the name ' '"),
+    "no name": (put("encoder", "name", value="a "), "has the name 'a '"),
     "images": (put("encoder", "images_seen", value=-5), "images_seen is -5"),
     "parameters": (put("encoder", "parameters", "touch", value=float("nan")), "touch is nan"),
     "a text for a number": (put("encoder", "size", value="32"), "size is 32"),

@@ -71,8 +71,7 @@ def refused(
         words = command.split() if isinstance(command, str) else command
         for name, place in {"tmp": tmp_path, "pack": pack.path, "run": finished, "out": tmp_path / "out"}.items():
             words = [word.replace(f"{{{name}}}", str(place)) for word in words]
-        traps = ((StepViews, "make"), (packing, "read_parts"), (probe_module, "features"))
-        for module, name in () if work else traps:
+        for module, name in () if work else ((StepViews, "make"), (packing, "read_parts"), (probe_module, "features")):
             monkeypatch.setattr(module, name, trap(name))
         before, elsewhere = snapshot(tmp_path), snapshot(finished)
         capsys.readouterr()
@@ -323,6 +322,7 @@ FILES: list[tuple[str, Spoil, str]] = [
     (INFO, cell("split", "tests"), "did you mean 'test'"),
     (INFO, cell("group", None), "group"),
     (INFO, cell("id", "0000"), "twice"),
+    (INFO, described("num", value=7), "samples.parquet cannot be used (it has"),
     ("probe {run} --on {tmp}/p", described("spec", "tasks", value=[]), "no labels"),
     (PROBE, bomb(MODEL, torch.save), MODEL),
     (PROBE, within(MODEL, write(safetensors.torch.save({"w": torch.ones(2)}))), "not written by mvitac"),

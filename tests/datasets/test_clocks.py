@@ -262,6 +262,9 @@ def test_a_table_of_videos_takes_the_times_beside_them_and_elements_of_lists_fro
         log.write('\n{"stamp": 5.01, "wrench": []}\n{"stamp": 5.02, "wrench": [0]}')
     with pytest.raises(ValueError, match=r"2/force.jsonl row 602: wrench\[1\] does not exist: wrench has 1 numbers"):
         FolderConfig(path=tmp_path / "m.csv", size=16, **options).source()
+    (tmp_path / "2/force.jsonl").write_text('{"stamp": 0, "wrench": [[1, 2], [3, 4]]}')
+    with pytest.raises(ValueError, match=r"2/force.jsonl row 1: wrench has lists in a list"):
+        FolderConfig(path=tmp_path / "m.csv", size=16, **options).source()
 
 
 def test_videos_without_labels_are_data(tmp_path: Path) -> None:

@@ -510,7 +510,7 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
         FolderConfig(path=tmp_path / "half flat").source()
     with pytest.raises(ValueError, match="column 'touch' has 1 images for 2 rows"):
         Manifest.of(tmp_path, [{"a": "0"}, {"a": "1"}], {"touch": [None]})
-    assert Manifest.of(tmp_path, ({"a": cell} for cell in (1, 2.0, None))).rows == [{"a": "1"}, {"a": "2"}, {"a": ""}]
+    assert Manifest.of(tmp_path, ({"a": cell} for cell in (1, "2.0", None))).rows == [{"a": "1"}, {"a": "2"}, {"a": ""}]
     (tmp_path / "same.csv").write_text("touch,split,n\na.png,train,1\nb.png,test,2\n")
     picture(tmp_path / "a.png")
     (tmp_path / "b.png").symlink_to("a.png")

@@ -265,6 +265,9 @@ def test_physiclear_newer_layout_and_missing_labels(clones: Path, tmp_path: Path
     file.write_text(file.read_text() + "TEXTURE_RANK = ['physiclear_thing_1']\n")
     with pytest.raises(ValueError, match="TEXTURE_RANK is no dict of names"):
         PhysiclearConfig(path=tmp_path / "new").source()
+    file.write_text(f"a = {'1+' * 3000}1")
+    with pytest.raises(ValueError, match=r"constants\.py cannot be read as labels"):
+        PhysiclearConfig(path=tmp_path / "new").source()
 
 
 def test_vt60_pairs_are_weak_but_right(packs: dict[str, Pack]) -> None:

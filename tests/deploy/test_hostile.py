@@ -200,7 +200,7 @@ EXPORTS: dict[str, tuple[dict[str, Any], str]] = {
     name: ({"about": change}, says)
     for name, (change, says) in {
         "no tolerance": (lambda about: about.pop("tolerance"), "is damaged"),
-        "no spread": (put("values", value={"force": [NO_SPREAD]}), "0 edges and 0 spreads: give n ascending"),
+        "no spread": (put("values", value={"force": [NO_SPREAD]}), "damaged.*edges and spread of n"),
         "a class that is no text": (put("classes", "pattern", value=[1]), r"export\.json: classes\.pattern: expected"),
         "no runtime": (put("runtime", value="x"), r"export\.json: runtime"),
         "no inputs": (put("inputs", value={}), "cannot be run"),

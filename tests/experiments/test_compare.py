@@ -138,9 +138,11 @@ def test_a_row_may_not_read_other_values(tmp_path: Path) -> None:
     column = pack.spec.values[0].targets[0].name
     lit = altered(Toy(values=True), lambda sample, _: {column: sample.columns[column] + 1})
     other = build(lit, tmp_path / "other", size=32, quiet=True)
-    rows = (Row(label="MViTac"), Row(label="other", set={"data.path": str(other.path)}))
+    text = build(altered(Toy(), lambda *_: {column: "a"}), tmp_path / "text", size=32, quiet=True)
+    rows = (Row(label="MViTac"), *(Row(label=p.path.name, set={"data.path": str(p.path)}) for p in (other, text)))
     work = lay_out(small(pack, rows=rows, seeds=1), pack, tmp_path / "out", ProbeConfig())
-    assert f"another column {column}" in work.left_out["other"]
+    for label in ("other", "text"):
+        assert f"another column {column}" in work.left_out[label]
 
 
 def test_scores_that_were_copied_from_another_run_are_computed_again(

@@ -236,8 +236,7 @@ def test_vicreg_weighs_its_terms() -> None:
     batch = views(method)
     found = outcome(method, batch)
     a, b = (method.towers["touch"](view) for view in batch.images["touch"])
-    s = (a - b).square().mean()
-    expected = 3 * s + 5 * (variance(a) + variance(b)) / 2 + 7 * (covariance(a) + covariance(b))
+    expected = 3 * (a - b).square().mean() + 5 * (variance(a) + variance(b)) / 2 + 7 * (covariance(a) + covariance(b))
     torch.testing.assert_close(found["touch"], expected, rtol=1e-4, atol=1e-4)
 
 
@@ -246,8 +245,7 @@ def test_supervised_learns_the_labels_that_probes_are_fitted_on(pack: Pack, conf
     """Also of a task with a split of its own, as rough of Touch and Go's lists, and of rows without the other sense."""
     first, second = pack.spec.tasks
     spec = replace(pack.spec, tasks=(first, replace(second, split="split_bright")))
-    turned = {"test": "train", "train": "test"}
-    own = [turned.get(s, s) if row % 2 else s for row, s in enumerate(pack.column("split"))]
+    own = [{"test": "train", "train": "test"}.get(s, s) if row % 2 else s for row, s in enumerate(pack.column("split"))]
     other = with_columns(pack, spec=spec, split_bright=own, has_vision=np.arange(pack.num) % 5 > 0)
     for sense in ("touch", "vision", "both"):
         method = config(modalities=() if sense == "both" else (sense,))

@@ -99,8 +99,7 @@ def test_what_rose_and_what_fell_is_told_by_a_paired_t_interval_over_groups() ->
     for name, w in wrong.items():
         rates = 1 - w / 10, 1 - np.array(before) / 10
         low, high = ttest_rel(*rates).confidence_interval(0.95)
-        gain = 100 * (rates[0] - rates[1]).mean()
-        texts[name] = f"touch/{name} {gain:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"
+        texts[name] = f"touch/{name} {100 * (rates[0] - rates[1]).mean():+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"
     assert said[0].endswith(f"on objects of val), rose: {texts['a']}")
     assert said[1:] == [f"fell: {texts['c']}", f"neither: {texts['b']}"]
     assert verdict({}, {}, "object")[0].startswith("split val has no labels of two classes, and no values")

@@ -121,7 +121,8 @@ def wrong_name(name: str, controls: Sequence[str]) -> str:
     """What an encoder cannot be called; "" if it can."""
     if name.strip().casefold() in controls:
         return f"has the name of a control, {name!r}"
-    return "" if name.strip() and name.isprintable() and len(name) <= MAX_NAME else f"has the name {name[:MAX_NAME]!r}"
+    good = name == name.strip() != "" and name.isprintable() and len(name) <= MAX_NAME
+    return "" if good else f"has the name {name[:MAX_NAME]!r}"
 
 
 def problems_of(encoder: dict[str, Any], controls: Sequence[str]) -> Iterator[str]:
@@ -294,7 +295,6 @@ def _num_answers(n: Any, value: Any, square: Any, squared: Any) -> int:
         middle = value[own].sum() / n[own].sum()  # an answer is a root of the sum of its groups
         away = np.sqrt(max((squared - square)[own].sum() / n[own].sum() + middle**2, 0))
         made = np.array([square - 2 * c * value + n * c**2 for c in (middle - away, middle + away)])[:, own]
-        near = abs(made - squared[own]) <= 1e-4 * (square + n * (middle**2 + away**2))[own]
-        if not near.all(1).any():
+        if not (abs(made - squared[own]) <= 1e-4 * (square + n * (middle**2 + away**2))[own]).all(1).any():
             first, found = last - 1, found + 1
     return found

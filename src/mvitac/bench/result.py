@@ -114,5 +114,4 @@ def suite_of(value: dict[str, Any]) -> Suite:
 def pinned_of(suite: Suite, block: dict[str, Any]) -> str:
     """Whether the data of a block is what the suite was measured on (``suite.Pinned``)."""
     (one,) = (one for one in suite.sets if one.name == block["set"])
-    forms = {form.name: form for form in one.forms}
-    return pinned(forms[block["form"]], block["data"])
+    return pinned({form.name: form for form in one.forms}[block["form"]], block["data"])

@@ -331,4 +331,5 @@ def _say_sensors(engine: Engine, names: Iterable[str]) -> None:
 
 
 def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    sys.stderr.write(f"{text}\n")  # at once: several threads speak
+    sys.stderr.flush()

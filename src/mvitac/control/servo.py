@@ -205,8 +205,7 @@ def presses(name: str, seed: int, each: int, number: int) -> tuple[np.ndarray, n
     shape = draw_shape(rng, task.kinds[number % len(task.kinds)], textures(True))
     for _ in range(each):
         along = float(rng.uniform(-6, 25))
-        asked = task.target + rng.uniform(-1, 1, len(task.target)) * task.reach
-        state = _near(task, shape, asked, along)
+        state = _near(task, shape, task.target + rng.uniform(-1, 1, len(task.target)) * task.reach, along)
         images.append(Copy(rng, new=False).press(partial(task.indent, shape, state), rng))
         poses.append(task.pose(shape, state))
     return np.stack(images), np.stack(poses)

@@ -77,6 +77,8 @@ def build(
         busy = f"{out} is being packed by another process: waiting for it"
         with hold_lock(out, busy, wait=True, quiet=quiet) as left:
             partial = out.with_name(out.name + ".partial")
+            with contextlib.suppress(OSError):
+                partial.rmdir()  # an empty one is of a build that found the disk full
             if partial.exists() and not (left or (partial / "request.json").exists()):
                 raise ValueError(f"{partial} is no unfinished pack: delete it, or choose another --out")
             if not os.path.lexists(out):

@@ -67,6 +67,8 @@ class Pack:
         table = self._file("samples.parquet")
         try:
             self.table: pa.Table = pq.read_table(table)
+            if len(self.table) != self.num:
+                raise ValueError(f"it has {len(self.table)} rows, pack.json promises {self.num}")
             check_table(self.table, self.spec)
         except Exception as error:  # arrow raises several kinds for a damaged file
             raise ValueError(f"{table} cannot be used ({brief(error)}): make the pack again") from None

@@ -77,7 +77,7 @@ def _constants(root: Path) -> dict[str, Any]:
         for node in ast.parse(file.read_text(encoding="utf-8")).body:
             if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and node.targets[0].id in wanted:
                 found[node.targets[0].id] = ast.literal_eval(node.value)
-    except (SyntaxError, ValueError) as error:
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:  # two of deep expressions
         raise ValueError(f"{file} cannot be read as labels ({brief(error)})") from None
     for name in sorted(wanted - found.keys()):
         raise ValueError(f"{file} does not define {name}: check out the version the paper was published with")

@@ -3,6 +3,7 @@
 Groups that a run learned from, by any row, image or name, also without labels, are always fitted on and never tested.
 """
 
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -37,8 +38,10 @@ def fold_splits(pack: Pack, task: AnyTask, num: int, learned: Sequence[Source]) 
     if np.unique(strata, return_counts=True)[1].max() < num:  # none can be shared out
         strata = np.zeros(len(rows), int)
     found = []
-    for _, test in StratifiedGroupKFold(num, shuffle=True, random_state=0).split(rows, strata, groups):
-        split = np.where(known, "train", "hidden")
-        split[rows[test]] = "test"
-        found.append(split)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "The least populated class")  # is shared out as far as it goes
+        for _, test in StratifiedGroupKFold(num, shuffle=True, random_state=0).split(rows, strata, groups):
+            split = np.where(known, "train", "hidden")
+            split[rows[test]] = "test"
+            found.append(split)
     return found

@@ -91,8 +91,8 @@ def _check_row(plan: Plan, row: Row, pack: Pack) -> tuple[Pack, str]:
     answers = [f"label_{task.name}" for task in pack.spec.tasks]
     values = [target.name for task in pack.spec.values for target in task.targets]
     for name in ("id", "group", *pack.spec.split_columns, *answers, *values):
-        there = name in own.table.column_names
-        if not there or not np.array_equal(own.column(name), pack.column(name), equal_nan=name in values):
+        theirs = own.column(name) if name in own.table.column_names else np.zeros(0)
+        if not np.array_equal(theirs, pack.column(name), equal_nan=theirs.dtype.kind == "f" and name in values):
             raise ValueError(f"its data {own.path} has another column {name} than {pack.path}: give the same samples")
     run.check(own.spec, len(run.method.training_rows(own)), own.size)
     run.method.on_tiny_trunk(own.spec, run.encoder)

@@ -64,8 +64,7 @@ def bars(
             top = max(top, cell["high"])
         y += 1.25
     axes.set_yticks(list(ticks), list(ticks.values()), color=COLOURS["ink"])
-    right = max(1.0, 100 * (top + 0.15 * (top - least)))
-    axes.set(xlim=(100 * least, right), ylim=(y - 0.6, -0.7), xlabel=what)
+    axes.set(xlim=(100 * least, max(1.0, 100 * (top + 0.15 * (top - least)))), ylim=(y - 0.6, -0.7), xlabel=what)
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.grid(axis="x")
     axes.spines["left"].set_visible(False)

@@ -108,8 +108,7 @@ def render(
     # A copy has the same properties at every size.
     copy, paint = np.random.default_rng([_TAG, *sensor.name.encode(), unit]).spawn(2)
     imprint = imprint_mm.astype(np.float32)
-    light = _measured if sensor.calibration else _illuminate
-    picture = light(imprint, sensor, copy, paint, pixel_mm, gain)
+    picture = (_measured if sensor.calibration else _illuminate)(imprint, sensor, copy, paint, pixel_mm, gain)
     if sensor.marker_pitch_mm:
         _draw_markers(picture, imprint, sensor, copy, pixel_mm, shear_mm)
     _soil(picture, sensor, copy, pixel_mm)

@@ -142,6 +142,5 @@ def _scales(method: Method, encoders: Encoders) -> dict[int, float]:
             raise ValueError(f"the trunk of {name} names no layers: leave out --encoder.{name}.layer-decay")
         # timm gives a trunk without its classifier's layer the full rate at the end; here the heads are that layer.
         for group in param_groups_layer_decay(trunk, layer_decay=config.layer_decay):
-            scale = config.lr_scale * config.layer_decay * group["lr_scale"]
-            scales |= {id(p): scale for p in group["params"]}
+            scales |= {id(p): config.lr_scale * config.layer_decay * group["lr_scale"] for p in group["params"]}
     return scales

@@ -122,8 +122,7 @@ def apply(
 
     Computed in fp32 and rounded to ``dtype`` once, as autocast would round it before the first convolution.
     """
-    implementation = _one_by_one if images.device.type == "cpu" else _batched
-    return implementation(images, drawn, size, dtype, mean_std)
+    return (_one_by_one if images.device.type == "cpu" else _batched)(images, drawn, size, dtype, mean_std)
 
 
 def _one_by_one(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype, mean_std: MeanStd) -> Tensor:

@@ -83,6 +83,8 @@ def with_elements(table: Manifest, names: Iterable[str]) -> Manifest:
             if number >= len(cell) and text_of(cell[0]) not in ("", "None"):
                 has = f"{vector} has {len(cell)} numbers, counted from 0"
                 raise ValueError(f"{table.at(i)}: {name} does not exist: {has}")
+            if any("[" in part for part in cell):
+                raise ValueError(f"{table.at(i)}: {vector} has lists in a list: write them as one, or as columns")
         texts = (cell[number] if number < len(cell) else "" for cell in cells)
         found = ["" if text == "None" else text_of(text) for text in texts]
         rows = [{**row, name: text} for row, text in zip(rows, found, strict=True)]

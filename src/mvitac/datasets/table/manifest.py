@@ -54,14 +54,14 @@ class Manifest:
     def of(cls, path: Path, rows: Iterable[Mapping[str, Any]], images: Refs | None = None, **known: Any) -> "Manifest":
         """Return the table of ``rows`` that a reader made from ``path``; cells that a row lacks are empty.
 
-        Cells that are no text become one by ``text_of``. ``images`` and ``known`` are other fields of the table.
+        Cells become texts by ``text_of``; the text "nan" may be a name. ``images`` and ``known`` are other fields.
         """
         if not (rows := [*rows]):
             raise ValueError(f"{path} holds no rows: is it the right one, and whole?")
         for column in (column for column, refs in (images or {}).items() if len(refs) != len(rows)):
             raise ValueError(f"{path}: column {column!r} has {len((images or {})[column])} images for {len(rows)} rows")
         names = dict.fromkeys(name for row in rows for name in row)
-        rows = [{name: c if isinstance(c := row.get(name), str) else text_of(c) for name in names} for row in rows]
+        rows = [{n: text_of(c := row.get(n)) or (c if isinstance(c, str) else "") for n in names} for row in rows]
         where = {c: [str(ref).removeprefix(str(path)) for ref in refs] for c, refs in (images or {}).items()}
         known.setdefault("digest", digest([rows, where] if where else rows))
         return cls(path, rows, numbers=range(1, len(rows) + 1), images=images or {}, **known)
