@@ -64,6 +64,11 @@ def test_a_log_is_joined_by_time(tmp_path: Path, how: Any) -> None:
     assert np.allclose(found, force(time if how == "linear" else near), atol=1e-6)
     assert np.allclose(abs(found - force(time)).max(), 0 if how == "linear" else 0.009, atol=1e-6)
     assert (pack.column("label_kind") == (near >= 1)).all()  # a class is never between two others
+    more: dict[str, Any] = {"controls": ("c=kind", "f=Fz"), "values": ("Fz:N", "x=kind:1")}
+    named = packed(tmp_path / "set", tmp_path / "named", labels=("kind",), interpolate=how, **(LOG | more))
+    for name in ("label_kind", "Fz"):
+        assert (named.column(name) == pack.column(name)).all()
+    assert set(named.column("kind").astype(float)) == {0, 1}
     for i in range(pack.num):
         frame = shade(int(pack.column("frame")[i]), int(pack.column("recording")[i]))
         assert abs(pack.images["touch"][i].mean() - frame) < 6

@@ -199,8 +199,10 @@ def test_controls_are_numbers(tmp_path: Path, rows: Table) -> None:
     pack = packed(config(file, controls=("how wide=width", "both=width,seq")), tmp_path / "pack")
     assert pack.spec.controls == {"how wide": ("width",), "both": ("width", "seq")}
     assert pack.column("width").tolist() == [row["width"] for row in rows]
-    with pytest.raises(ValueError, match=r"row 1 .*control column 'side' is 'train', not a number"):
-        config(file, controls=("x=side",)).source()
+    for cell in ("train", "1e200"):
+        write([{**row, "side": cell} for row in rows], file)
+        with pytest.raises(ValueError, match=rf"row 1 .*control column 'side' is '{cell}', not a number"):
+            config(file, controls=("x=side",)).source()
 
 
 def test_has_touch_is_seen_not_believed(tmp_path: Path, rows: Table) -> None:

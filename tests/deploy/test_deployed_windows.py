@@ -17,6 +17,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import Window
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
+from mvitac.deploy.artifact import preprocessing
 from mvitac.deploy.engine import Engine, frame_shapes
 from mvitac.deploy.publish import publish
 from mvitac.live.contact import LiveConfig
@@ -72,6 +73,7 @@ def test_each_frame_is_minus_the_first_one_of_its_touch(published: Path, model: 
         wanted = ask(touch=np.stack([difference(frame, first) for frame in clip]))[name]
         torch.testing.assert_close(ask(touch=clip, background=first)[name], wanted)
         assert not torch.allclose(ask(touch=clip)[name], wanted)
+    assert "the background being the first frame of the touch" in preprocessing(other)["background"]
     other.spec = replace(other.spec, difference=True)
     with pytest.raises(ValueError, match="background cannot be used"):
         other.embed(touch=clip, background=first)

@@ -264,6 +264,9 @@ def test_classes_that_train_lacks_are_named_below_the_scores(runs: list[Path], p
     found = probe_runs(runs[:1], replace(asked, folds=2), with_columns(pack, label_pattern=labels))
     num, of = (labels == 2).sum(), {record["num_test"] for record in found["records"]}
     assert found["notes"][1:] == [f"pattern: {num} of {of.pop()} test rows have classes that train lacks: {name}"]
+    one = with_columns(pack, has_touch=pack.column("group") == pack.column("group")[0])
+    with pytest.raises(ValueError, match=r"fold . of 2: .* with touch in split"):
+        probe_runs(runs[:1], replace(asked, folds=2), one)
 
 
 def test_seeds_whose_automatic_precision_differs_are_seeds_of_one_run(pack: Pack, tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from mvitac.experiments import table_formats
 from mvitac.experiments.table import lines_of, target_lines
 from mvitac.report import figures
 from mvitac.report.report import write_report
+from mvitac.report.sections import Study
 from mvitac.report.tables import print_summary
 from mvitac.system.files import read_json
 from mvitac.training.loop import train
@@ -91,7 +92,7 @@ def test_targets_have_scores_of_their_own(scored: tuple[Path, Pack, dict[str, An
 
 
 def test_the_report_shows_values(scored: tuple[Path, Pack, dict[str, Any]], tmp_path: Path) -> None:
-    run, _, result = scored
+    run, pack, result = scored
     page = write_report([run], tmp_path, result=result, quiet=True).read_text().replace("\xa0", " ")
     drawn_texts = "".join(drawings(page))
     for target in result["summary"]["both"]["touch"]["mvitac"]["targets"]:
@@ -99,6 +100,10 @@ def test_the_report_shows_values(scored: tuple[Path, Pack, dict[str, Any]], tmp_
     assert cell_text(result["summary"]["light"], "untrained", "vision") in page
     drawn = {file.name for file in (tmp_path / "figures").iterdir()}
     assert {"predicted-light--level.png", "predicted-both--weight.png"} <= drawn
+    study = Study([], pack, {}, tmp_path / "alike")
+    for name in ("a b", "a-b", "a b", "x" * 240):
+        study.figure(name, figures.new_figure("", 1)[0], "")
+    assert {file.stem for file in (tmp_path / "alike/figures").iterdir()} == {"a-b", "a-b-2", "x" * 80}
     assert ">R2 %, mean and 95 % interval" in drawn_texts and ">accuracy %, mean and 95 % interval" in drawn_texts
 
 

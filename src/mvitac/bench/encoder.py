@@ -75,8 +75,9 @@ def measure(
     path = out / f"{slug(suite.name + '-' + encoder['name'])}.json"
     check_place(path)
     old: dict[str, Any] = read_signed(path, form) if path.exists() else {"encoder": encoder}
-    if (of := old["encoder"]["weights"]) != encoder["weights"]:
-        raise ValueError(f"{path} is the result of other weights ({of[0][:12]}): give --name, or another --out")
+    for key in ("name", "weights"):
+        if (of := old["encoder"][key]) != encoder[key]:
+            raise ValueError(f"{path} is the result of other {key} ({str(of)[:14]}): give --name, or another --out")
     if old.get("suite_digest", suite.digest()) != suite.digest():
         raise ValueError(f"{path} is the result of another suite {suite.name!r}: rename it, or give another --out")
     start = time.perf_counter()

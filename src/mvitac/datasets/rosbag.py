@@ -64,7 +64,7 @@ class RosbagConfig(RecordedConfig):
         cameras = [topic for topic in (*self.touch, self.vision) if topic]
         named = *self.labels, *self.numbers(), *self.conditioned()
         named = *named, self.group, self.touch_group, self.split, self.sensor
-        smooth, every = self.numbers() if self.interpolate == "linear" else (), self.every or 1
+        smooth, every = self.smooth(), self.every or 1
         rows: list[Row] = []
         images: Refs = {topic: [] for topic in cameras}
         dropped, same = 0, Counter[str]()

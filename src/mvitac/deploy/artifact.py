@@ -29,6 +29,7 @@ SUBTRACTED = (
     "subtracted: touch is (touch - background) / 2 + 128, the background being the sensor without contact; `mvitac live`"
     " does this itself, `embed` and `predict` given background=..., and whoever calls an export does it first"
 )
+FIRST_SUBTRACTED = SUBTRACTED.replace("the sensor without contact", "the first frame of the touch")
 LAYOUT = (
     "channels of the newest frame first; frames are `stride` units of column `order` apart (time: seconds); at the start"
     " of a touch its first frame repeats; minus_first: (frame - first frame of the touch) / 2 + 128"
@@ -80,6 +81,7 @@ def pull(repo: str, revision: str | None) -> Path:
 
 def preprocessing(model: Model) -> dict[str, Any]:
     """Description of the preprocessing from a camera's frame to the encoders' input, JSON-ready."""
+    given = FIRST_SUBTRACTED if model.spec.window.minus_first and "touch" in model.spec.window.of else AS_GIVEN
     return {
         "input": "uint8 RGB [H, W, C]; OpenCV's frames are BGR: reverse their channels",
         "colour_order": "RGB",
@@ -90,7 +92,7 @@ def preprocessing(model: Model) -> dict[str, Any]:
         "mean": {m: list(model.run.encoder[m].mean_std[0]) for m in model.encoders},
         "std": {m: list(model.run.encoder[m].mean_std[1]) for m in model.encoders},
         "difference": model.spec.difference,
-        "background": SUBTRACTED if model.spec.difference else AS_GIVEN,
+        "background": SUBTRACTED if model.spec.difference else given,
         "crop": model.spec.crop,
         "sensors": list(model.spec.sensors),
         **({"window": {**to_json(model.spec.window), "layout": LAYOUT}} if model.spec.window.active else {}),

@@ -186,7 +186,10 @@ def _in_folds(
         folds.append([])
         for task, cells in splits:
             own = [(model, data.with_splits(cells[k])) for model, data in others]
-            folds[k] += score(pack.with_splits(cells[k]), own, [task])[0]
+            try:
+                folds[k] += score(pack.with_splits(cells[k]), own, [task])[0]
+            except ValueError as error:
+                raise ValueError(f"fold {k + 1} of {num}: {error}; give other --folds") from None
     tested = f"{num} folds: every {pack.spec.group_by} that no run learned from is tested once"
     return pool(folds), [tested, *_unlearned([(task, map(pack.with_splits, cells)) for task, cells in splits])]
 

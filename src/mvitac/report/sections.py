@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,7 @@ class Study:
     pack: Pack
     result: dict[str, Any]
     out: Path
+    files: dict[str, str] = field(default_factory=dict)  # of figures -> their names
 
     @property
     def sources(self) -> list[str]:
@@ -64,7 +65,9 @@ class Study:
 
     def figure(self, name: str, drawing: Figure, alt: str, caption: str = "") -> Markup:
         """Save ``drawing`` as a PNG in figures/ and return it as a block."""
-        safe = "".join(c if c.isalnum() else "-" for c in name.lower())
+        safe = "".join(c if c.isalnum() else "-" for c in name.lower()[:80])
+        while self.files.setdefault(safe, name) != name:
+            safe += "-2"
         write_atomic(self.out / "figures" / f"{safe}.png", lambda file: file.write(figures.to_png(drawing)))
         return html.figure(html.image(figures.to_svg(drawing), alt), caption)
 

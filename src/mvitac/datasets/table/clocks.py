@@ -91,14 +91,14 @@ def join(
     images: Sequence[str],
     *,
     numbers: Collection[str],
+    smooth: Collection[str],
     tolerance: float,
-    linear: bool,
 ) -> Manifest:
     """Return the rows of ``table`` with the columns of ``logs`` at their time, and a note about each log.
 
     Rows without a measurement within ``tolerance`` seconds are left out; nothing is extrapolated. ``images``: names that
-    columns of images may have, the most important first. ``numbers`` are interpolated if ``linear``; then both neighbours
-    must be near enough. Others are nearest.
+    columns of images may have, the most important first. ``numbers`` may be elements of lists. Those of ``smooth`` are
+    interpolated; then both neighbours must be near enough. Others are nearest.
     """
     shown = next((column for column in images if column in table.columns), None)
     refs: list[ImageRef | None] = table.refs(shown) if shown else [None] * len(table.rows)
@@ -120,7 +120,7 @@ def join(
                 raise ValueError(f"{where}: mend it, or sort the rows by time")
             same += len(stamps) - (distinct := len(np.unique(stamps)))
             apart += len({(at, *row.values()) for at, row in zip(stamps, log.rows, strict=True)}) - distinct
-            cells, largest = joined(log, stamps, times[at], (numbers if linear else ()), tolerance)
+            cells, largest = joined(log, stamps, times[at], smooth, tolerance)
             gap = max(gap, largest)
             if not any(cells):
                 own, theirs = (f"{np.nanmin(t):.3f} to {np.nanmax(t):.3f} s" for t in (stamps, times[at]))

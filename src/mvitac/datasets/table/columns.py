@@ -141,9 +141,9 @@ def read_controls(table: Manifest, columns: Iterable[str], labels: Sequence[Sequ
     for column in columns:
         values = [number_of(row[column]) for row in table.rows]
         for i, value in enumerate(values):
-            if value is None and labelled[i]:
-                cell = table.rows[i][column]
-                raise ValueError(f"{table.at(i)} is labelled, and control column {column!r} is {cell!r}, not a number")
+            if labelled[i] and (value is None or abs(value) > 1e30):  # which probes could not square
+                cell = f"{column!r} is {table.rows[i][column]!r}, not a number below 1e30"
+                raise ValueError(f"{table.at(i)} is labelled, and control column {cell}")
         made[column] = [value or 0.0 for value in values]
     return made
 

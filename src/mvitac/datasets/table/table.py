@@ -100,7 +100,7 @@ class RowsConfig(DatasetConfig, ABC):
     """Part of the images to use, as COLUMN=x:y:width:height in pixels from the top left corner, e.g. touch=40:0:560:480.
     It is squeezed to a square, as every image is."""
     range: tuple[str, ...] = ()
-    """Of images of 16 bits or floating-point numbers (.png, .tif, .npy, arrays): what becomes black and white, as
+    """Of images of uint16 or floating-point numbers (.png, .tif, .npy, arrays): what becomes black and white, as
     COLUMN=LOW:HIGH; by default 0 and 65535, or 0 and 1 of floats."""
     bgr: bool = False
     """Images are stored blue first, as OpenCV writes arrays to HDF5 or zarr."""
@@ -137,8 +137,15 @@ class RowsConfig(DatasetConfig, ABC):
 
     def numbers(self) -> list[str]:
         """Return the manifest columns that hold numbers: those of values, and those of controls."""
-        named = [target.name for text in self.values for target in value_task(text).targets]
-        return [*named, *(column for used in self.control_columns().values() for column in used)]
+        return [*self._targets(), *(column for used in self.control_columns().values() for column in used)]
+
+    def smooth(self) -> list[str]:
+        """Return the columns that are interpolated in logs: values that are not also a name of something."""
+        names = {*self.labels, self.group, self.touch_group, self.split, self.sensor}
+        return [name for name in self._targets() if self.interpolate == "linear" and name not in names]
+
+    def _targets(self) -> list[str]:
+        return [target.name for text in self.values for target in value_task(text).targets]
 
     def looks(self) -> dict[str, dict[str, Any]]:
         """Return image column -> fields of its references: crop, span and bgr."""
@@ -193,7 +200,7 @@ class Rows(Source):
         table = config.manifest()
         if config.log:
             names = [name for name in (*config.touch, config.vision, "touch", "left", "right", "vision") if name]
-            how: Any = {"tolerance": config.tolerance, "linear": config.interpolate == "linear"}
+            how: Any = {"smooth": config.smooth(), "tolerance": config.tolerance}
             table = clocks.join(table, config.log, names, numbers=config.numbers(), **how)
         table = columns.with_elements(table, config.numbers())
         self._digest = table.digest
