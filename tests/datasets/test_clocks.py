@@ -105,6 +105,9 @@ def test_a_clock_that_is_off_is_named_and_set_right(tmp_path: Path) -> None:
         packed(root, tmp_path / "no", **LOG)
     pack = packed(root, tmp_path / "p", **{**LOG, "log": (f"force.csv:stamp-{START:.0f}",)})
     assert np.allclose(pack.values(pack.spec.values[0])[:, 0], force(pack.column("time").astype(float)), atol=1e-4)
+    for k in range(3):  # stamps of the images, but for rounding, and further apart than the tolerance
+        write_csv(root / f"{k}/late.csv", stamp=0.04 * np.arange(50) + 0.35, Fz=np.arange(50))
+    assert packed(root, tmp_path / "late", **{**LOG, "log": ("late.csv:stamp-0.35",)}).num == 150
 
 
 def test_times_of_frames_may_stand_beside_the_video(tmp_path: Path) -> None:

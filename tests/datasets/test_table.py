@@ -215,11 +215,14 @@ def pressed(root: Path) -> Table:
 
 def test_backgrounds_by_row(tmp_path: Path) -> None:
     rows = pressed(tmp_path)
-    pack = packed(table(tmp_path / "m.csv", rows), tmp_path / "p", labels=("label",), difference=True)
-    assert pack.spec.difference
-    for i, name in enumerate(pack.column("id")):
-        number = int(name) - 1
-        assert (pack.images["touch"][i] == (rows[number]["value"] - 50 - number + 256) // 2).all()
+    for free in (50, 20):  # of files that change
+        for i in range(24):
+            picture(tmp_path / f"own{i}.png", free + i)
+        pack = packed(table(tmp_path / "m.csv", rows), tmp_path / f"p{free}", labels=("label",), difference=True)
+        assert pack.spec.difference
+        for i, name in enumerate(pack.column("id")):
+            number = int(name) - 1
+            assert (pack.images["touch"][i] == (rows[number]["value"] - free - number + 256) // 2).all()
 
 
 def test_backgrounds_by_sensor(tmp_path: Path) -> None:

@@ -188,6 +188,7 @@ def test_retrieval_by_group() -> None:
     assert d.retrieval_ranks(gallery, gallery, groups).tolist() == [0] * 6
     wrong = torch.eye(3)[(groups + 1) % 3] + 0.1 * torch.eye(3)[groups]
     assert d.retrieval_ranks(wrong, gallery, groups).tolist() == [1] * 6
+    assert d.retrieval_ranks(-gallery, gallery, 7 * groups + 3).tolist() == [2] * 6
     constant = torch.ones(6, 3)
     assert d.retrieval_ranks(constant, constant, groups).tolist() == [2] * 6, "ties must not retrieve"
     assert d.recall_at(torch.tensor([0, 1, 4, 9]), (1, 5, 10)) == {"R@1": 0.25, "R@5": 0.75, "R@10": 1.0}

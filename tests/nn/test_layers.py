@@ -14,7 +14,7 @@ from torch import nn
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, build_trunk, sin_cos_positions
 from mvitac.nn.folded import folded
 from mvitac.nn.losses import info_nce
-from mvitac.nn.small_conv import _Product, use_convolutions, use_products
+from mvitac.nn.small_conv import DepthwiseConv2d, SmallMapConv2d, _Product, use_convolutions, use_products
 from mvitac.nn.vit import encode_visible, patches, row_uniform
 
 
@@ -53,14 +53,15 @@ def test_equals_the_convolution_and_its_gradients(
     shape = (6, out, kernel, stride, 0 if same else kernel // 2)
     theirs = (Conv2dSame if same else nn.Conv2d)(*shape, groups=groups, bias=False).to(dtype)
     ours = use_products(nn.Sequential(copy.deepcopy(theirs))).get_submodule("0")
-    images = torch.randn(4, 6, *side, dtype=dtype).to(memory_format=torch.channels_last).requires_grad_()
-    got, want = ours(images), theirs(images)
-    assert kind.removesuffix("Same") in type(got.grad_fn).__name__
-    torch.testing.assert_close(got, want)
-    torch.testing.assert_close(ours.eval()(images), want)
-    towards = torch.randn_like(want)
-    mine = torch.autograd.grad(got, (images, *ours.parameters()), towards)
-    torch.testing.assert_close(mine, torch.autograd.grad(want, (images, *theirs.parameters()), towards))
+    for layout in (torch.channels_last, torch.contiguous_format):
+        images = torch.randn(4, 6, *side, dtype=dtype).to(memory_format=layout).requires_grad_()
+        got, want = ours.train()(images), theirs(images)
+        assert kind.removesuffix("Same") in type(got.grad_fn).__name__
+        torch.testing.assert_close(got, want)
+        torch.testing.assert_close(ours.eval()(images), want)
+        towards = torch.randn_like(want)
+        mine = torch.autograd.grad(got, (images, *ours.parameters()), towards)
+        torch.testing.assert_close(mine, torch.autograd.grad(want, (images, *theirs.parameters()), towards))
     assert type(use_convolutions(nn.Sequential(ours)).get_submodule("0")) is type(theirs)
 
 
@@ -76,6 +77,9 @@ def test_gradients_have_the_weights_layout_and_bf16_autocast_is_as_close_as_the_
         got = conv(images)
     assert got.dtype == torch.bfloat16
     torch.testing.assert_close(got.float(), want, atol=0.02, rtol=0.02)
+    for kind, groups in ((SmallMapConv2d, 1), (DepthwiseConv2d, 5)):
+        conv = kind(5, 5, 3, padding=1, groups=groups)  # with a bias
+        torch.testing.assert_close(conv(images), nn.Conv2d.forward(conv, images))
 
 
 def products(trunk: nn.Module, images: torch.Tensor) -> int:

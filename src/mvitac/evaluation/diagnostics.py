@@ -89,7 +89,7 @@ def retrieval_ranks(
 
     With one gallery entry per group, chance level R@k is exactly k / number of groups.
     """
-    gallery = F.normalize(gallery.float(), dim=1)
+    gallery, groups = F.normalize(gallery.float(), dim=1), groups.unique(return_inverse=True)[1]
     sums = torch.zeros(int(groups.max()) + 1, gallery.shape[1]).index_add_(0, groups, gallery)
     similarity = F.normalize(query.float(), dim=1) @ F.normalize(sums, dim=1).T
     # Ties count against the query, or constant embeddings would score.

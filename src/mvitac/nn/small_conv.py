@@ -30,7 +30,8 @@ class SmallMapConv2d(nn.Conv2d):
         stride = self.stride[0]
         pixels = ((height - 1) // stride + 1) * ((width - 1) // stride + 1)
         # Exports and compiled graphs keep the convolution as such.
-        if not self.training or input.device.type != "cpu" or pixels > MAX_PIXELS or torch.compiler.is_compiling():
+        large = pixels > MAX_PIXELS or input.device.type != "cpu"
+        if large or not self.training or self.bias is not None or torch.compiler.is_compiling():
             return super().forward(input)
         weight = self.weight
         if torch.is_autocast_enabled("cpu"):
@@ -66,7 +67,7 @@ def _pays(conv: Any, input: Tensor) -> bool:
     pixels = -(-input.shape[2] // conv.stride[0]) * -(-input.shape[3] // conv.stride[0])
     small = pixels <= MAX_PIXELS_DEPTHWISE[conv.kernel_size[0]]
     plain = input.dtype == torch.float32 and not torch.is_autocast_enabled("cpu") and not torch.compiler.is_compiling()
-    return small and plain and conv.training and input.device.type == "cpu"
+    return small and plain and conv.training and conv.bias is None and input.device.type == "cpu"
 
 
 PLAIN = {SmallMapConv2d: nn.Conv2d, DepthwiseConv2d: nn.Conv2d, DepthwiseConv2dSame: Conv2dSame}
@@ -115,7 +116,7 @@ def _rows(height: int, width: int, stride: int) -> list[tuple[int, int, slice, s
 
 
 class _Product(torch.autograd.Function):
-    """Input [B, C, H, W], weight [O, C, 3, 3] -> [B, O, H', W'], all channels-last in memory."""
+    """Input [B, C, H, W], weight [O, C, 3, 3] -> [B, O, H', W'], channels-last in memory; fast if both are, too."""
 
     @staticmethod
     def forward(ctx: Any, input: Tensor, weight: Tensor, stride: int) -> Tensor:
@@ -135,7 +136,7 @@ class _Product(torch.autograd.Function):
         pixels, kernel = ctx.saved_tensors
         height, width, stride = ctx.shape
         gradient = gradients[0].permute(0, 2, 3, 1).reshape(len(pixels), -1, len(kernel))
-        of_pixels = torch.zeros_like(pixels) if ctx.needs_input_grad[0] else None
+        of_pixels = pixels.new_zeros(pixels.shape) if ctx.needs_input_grad[0] else None  # or ``flatten`` copies
         of_kernel = torch.zeros_like(kernel) if ctx.needs_input_grad[1] else None
         for out, row, columns, under in _rows(height, width, stride):
             if of_kernel is not None:

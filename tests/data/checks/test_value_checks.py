@@ -105,6 +105,11 @@ def test_missing_values(tmp_path: Path) -> None:
     assert value_checks.values(scored)[0].verdict == "look"
 
 
+def test_a_few_rows_of_noise_have_no_shift() -> None:
+    noise = np.random.default_rng(0).normal(size=(2, 15))
+    assert not value_checks._shift(*noise, np.arange(15))[1].any()
+
+
 def test_a_stretch_of_zeros_is_no_contact(healthy: Pack) -> None:
     force = healthy.column("force_n")
     for value in (0, 1):

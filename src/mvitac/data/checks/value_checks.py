@@ -159,6 +159,6 @@ def _shift(change: np.ndarray, value: np.ndarray, rows: np.ndarray) -> tuple[np.
     for lag in range(-longest, longest + 1):
         a, b = change[rows[max(0, -lag) : len(rows) - max(0, lag)]], value[rows[max(0, lag) : len(rows) + min(0, lag)]]
         both = np.isfinite(a) & np.isfinite(b)
-        still = both.sum() < 8 or min(np.ptp(a[both]), np.ptp(b[both])) < 1e-6
+        still = both.sum() < 16 or min(np.ptp(a[both]), np.ptp(b[both])) < 1e-6
         curve.append(0.0 if still else np.corrcoef(a[both], b[both])[0, 1])
     return rows, np.array(curve)

@@ -20,6 +20,8 @@ from mvitac.datasets.table.image_refs import Frame, ImageRef
 from mvitac.datasets.table.manifest import READERS, Manifest, Row, read_manifest, text_of
 from mvitac.system.files import check_ordinary, digest
 
+SLACK = 1e-6  # s: doubles of stamps since 1970 are 2.4e-7 s apart
+
 
 def nearest(times: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the index in ascending ``times`` [N] nearest to each of ``wanted`` [M], and the distance in seconds."""
@@ -183,7 +185,7 @@ def joined(
     order = np.argsort(stamps, kind="stable")
     stamps = stamps[order]
     at, away = nearest(stamps, times)
-    good = away <= tolerance + 1e-9
+    good = away <= tolerance + SLACK
     if not good.any():
         return [{} for _ in times], 0.0
     gaps = np.diff(stamps)[np.diff(np.searchsorted(np.sort(times), stamps)) > 0]  # of those between recordings none
@@ -195,11 +197,11 @@ def joined(
         if (filled.all() and not linear) or not len(own):
             continue
         at, away = nearest(own, times)
-        near, cells = away <= tolerance + 1e-9, texts[filled][at].tolist()
+        near, cells = away <= tolerance + SLACK, texts[filled][at].tolist()
         if linear:
             after = np.clip(np.searchsorted(own, times), min(1, len(own) - 1), len(own) - 1)
             ends = np.abs(own[[after - 1, after]] - times).max(0)
-            near &= ((ends <= tolerance + 1e-9) & (times >= own[0]) & (times <= own[-1])) | (away == 0)
+            near &= ((ends <= tolerance + SLACK) & (times >= own[0]) & (times <= own[-1])) | (away <= SLACK)
             cells = [text_of(float(f"{value:.9g}")) for value in np.interp(times, own, known[filled])]
         good &= near | ~filled.all()
         columns[name] = [cell if here else "" for cell, here in zip(cells, near, strict=True)]

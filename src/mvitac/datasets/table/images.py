@@ -92,6 +92,7 @@ def check_present(
 
 def check_files(table: Manifest, columns: Sequence[str], grounds: Sequence[Background]) -> dict[str, Stamp]:
     """Return the stamp of each image file; ValueError if one is missing or empty, or twice in a row's ``columns``."""
+    mean_image.cache_clear()  # a background may have changed since
     stamps: dict[str, Stamp] = {}
     missing: list[str] = []
     num = 0
