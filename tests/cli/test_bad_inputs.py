@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -72,7 +73,7 @@ def refused(
         for name, place in {"tmp": tmp_path, "pack": pack.path, "run": finished, "out": tmp_path / "out"}.items():
             words = [word.replace(f"{{{name}}}", str(place)) for word in words]
         for module, name in () if work else ((StepViews, "make"), (packing, "read_parts"), (probe_module, "features")):
-            monkeypatch.setattr(module, name, trap(name))
+            monkeypatch.setattr(module, name, Mock(side_effect=WorkBegan(name)))
         before, elsewhere = snapshot(tmp_path), snapshot(finished)
         capsys.readouterr()
         code = main(words)
@@ -88,13 +89,6 @@ def refused(
         return last
 
     return refuse
-
-
-def trap(name: str) -> Callable[..., Any]:
-    def sprung(*_: object, **__: object) -> None:
-        raise WorkBegan(name)
-
-    return sprung
 
 
 PRETRAIN = "pretrain --recipe smoke --data pack --data.path {pack} --quiet --out {out} "

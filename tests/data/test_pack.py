@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -137,21 +138,14 @@ def test_one_process_packs_and_the_others_wait(
 
 
 def test_packs_where_files_cannot_be_locked(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def flock(*_: Any) -> None:
-        raise OSError(errno.ENOSYS, "Function not implemented")
-
-    monkeypatch.setattr(fcntl, "flock", flock)
+    monkeypatch.setattr(fcntl, "flock", Mock(side_effect=OSError(errno.ENOSYS, "Function not implemented")))
     assert toy_pack(tmp_path / "p").digest == pack.digest and [path.name for path in tmp_path.iterdir()] == ["p"]
-
-
-def killed(*_: object) -> None:
-    raise KeyboardInterrupt
 
 
 def almost_finished(path: Path, source: Source) -> Path:
     """What is left of packing ``source`` if the build is killed after the last part."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(packing._Partial, "finish", killed)
+        patch.setattr(packing._Partial, "finish", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             build(source, path, size=32, quiet=True)
     return path.with_name(path.name + ".partial")
@@ -206,7 +200,7 @@ def test_killed_while_it_is_finished(pack: Pack, tmp_path: Path, monkeypatch: py
     """After the headers were written for fewer rows than were expected."""
     options: dict[str, Any] = {"size": 32, "max_damaged": 0.05, "quiet": True}
     with monkeypatch.context() as patch:
-        patch.setattr(packing, "digest_file", killed)
+        patch.setattr(packing, "digest_file", Mock(side_effect=KeyboardInterrupt))
         for name in ("p", "q"):
             with pytest.raises(KeyboardInterrupt):
                 build(Stamped(damaged=(3, 40)), tmp_path / name, **options)
