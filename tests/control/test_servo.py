@@ -132,10 +132,6 @@ def test_a_result_repeats(done: Path, small: Servo, tmp_path: Path, capsys: pyte
     assert f"{len(value['rows'])} rows hold" in capsys.readouterr().out
 
 
-def _true(value: dict[str, Any]) -> None:
-    next(row for row in value["rows"] if row["source"] == "true pose")["cells"][3]["mm"][0] += 0.5
-
-
 def _late(value: dict[str, Any]) -> None:
     value["suite"]["conditions"][1]["latency_ms"] = 0
     value["suite_digest"] = digest(value["suite"])
@@ -151,23 +147,20 @@ def _copied(value: dict[str, Any]) -> None:
     second |= {key: first[key] for key in ("mm", "deg", "lost")}
 
 
-def _blind_late(value: dict[str, Any]) -> None:
-    next(row for row in value["rows"] if row["source"] == "no touch")["cells"][1]["mm"][0] += 0.1
-
-
 def _not_lost(value: dict[str, Any]) -> None:
-    cell = next(row for row in value["rows"] if row["source"] == "no touch")["cells"][0]
+    cell = value["rows"][BLIND]["cells"][0]
     limit, n = task_of(cell["task"]).limit, cell["n"][0]
     cell["mm"][0], cell["deg"][0] = n * limit[0], n * float(np.hypot.reduce(limit[1:]))
 
 
+TRUE, BLIND = -3, -2  # places of the rows "true pose" and "no touch"
 _PERFECT = {"mm": [0.0] * 2, "deg": [0.0] * 2, "lost": [0.0] * 2}
 CHANGES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "no episodes give": put("rows", 0, "cells", 0, "mm", 0, value=-1.0),
     "no touch, .* no episodes give": _not_lost,
     "the encoder, .* no episodes give": lambda value: value["rows"][0]["cells"][0].update(_PERFECT),
     "no digests of what": put("data", "edge", value=None),
-    "other sums here": _true,
+    "other sums here": put("rows", TRUE, "cells", 3, "mm", 0, value=lambda mm: mm + 0.5),
     "the suite asks for": lambda value: value["rows"].pop(3),
     "not of this version's": _late,
     "other tasks": lambda value: value["rows"][0]["cells"].pop(),
@@ -177,7 +170,7 @@ CHANGES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "has the unknown field 'score'": put("rows", 0, "cells", 0, "score", value=1.0),
     "its sums are not of": lambda value: value["rows"][0]["cells"][0]["mm"].pop(),
     "the encoder, seed 5, .* has the sums of the encoder, seed 5": _copied,
-    "no touch, .* sees nothing, and does otherwise": _blind_late,
+    "no touch, .* sees nothing, and does otherwise": put("rows", BLIND, "cells", 1, "mm", 0, value=lambda mm: mm + 0.1),
     "a sum is no number": put("rows", 0, "cells", 0, "mm", 0, value="1.0"),
     "untrained, seed 1, .* has the sums of untrained, seed 0": _twin,
 }
@@ -199,7 +192,7 @@ def test_changed_results_are_refused(done: Path, tmp_path: Path, why: str) -> No
 
 def test_constant_features_are_no_copies(done: Path, tmp_path: Path) -> None:
     value = json.loads(done.read_text())
-    value["rows"][0]["cells"] = next(row["cells"] for row in value["rows"] if row["source"] == "no touch")
+    value["rows"][0]["cells"] = value["rows"][BLIND]["cells"]
     value["digest"] = digest({key: part for key, part in value.items() if key not in VOLATILE})
     (path := tmp_path / "constant.json").write_text(json.dumps(value))
     assert result.read_control(path)[1] == value
