@@ -236,8 +236,7 @@ def test_a_film_without_touch_comes_after_the_table(
     command = ["ablate", f"{policy}:act", "--data", "insert-v1/vision/4", "--out"]
     assert main([*command, str(tmp_path / "film.png")]) == 2 and "name of a .webp" in capsys.readouterr().err
     film = tmp_path / "new" / "film.webp"
-    assert main([*command, str(film)]) == 0
-    assert capsys.readouterr().out.endswith(f"written: {film}\n")
+    assert main([*command, str(film)]) == 0 and capsys.readouterr().out.endswith(f"written: {film}\n")
     with Image.open(film) as made:
         assert made.n_frames == 18
 
@@ -277,8 +276,7 @@ def test_command(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str])
         ("...\npolicy.reset = lambda: 1 / 0", "(ZeroDivisionError: division by zero) when reset before episode 1"),
     ):
         file.write_text(f"import sys, numpy as np\nseen = []\ndef policy(o):\n    {code}\n")
-        assert main(["ablate", f"{file}:policy", "--data", str(pack.path)]) == 2
-        assert says in capsys.readouterr().err
+        assert main(["ablate", f"{file}:policy", "--data", str(pack.path)]) == 2 and says in capsys.readouterr().err
     file.write_text("import nothing_such\n")
     with pytest.raises(ValueError, match=r"mine.py:policy cannot be imported \(ModuleNotFoundError: .*nothing_such"):
         open_policy(f"{file}:policy")

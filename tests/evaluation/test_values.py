@@ -43,9 +43,8 @@ def test_scores_are_those_of_scikit_learn_without_a_group_and_over_the_rows_that
     record = score_values(y, guess, groups, POSE)
     for t, found in enumerate(record["targets"]):
         have = ~np.isnan(y[:, t])
-        assert found["r2"] == pytest.approx(r2_score(y[have, t], guess[have, t]))
-        assert found["mae"] == pytest.approx(mean_absolute_error(y[have, t], guess[have, t]))
-        assert found["rmse"] == pytest.approx(root_mean_squared_error(y[have, t], guess[have, t]))
+        for name, score in (("r2", r2_score), ("mae", mean_absolute_error), ("rmse", root_mean_squared_error)):
+            assert found[name] == pytest.approx(score(y[have, t], guess[have, t])), name
         assert sum(part["n"] for part in found["ranges"]) == have.sum()
     assert record["r2"] == pytest.approx(np.mean([found["r2"] for found in record["targets"]]))
     assert record["num_test"] == len(y)
