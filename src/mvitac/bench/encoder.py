@@ -136,10 +136,9 @@ def _of_run(model: Model, path: Path) -> dict[str, Any]:
 
 def _images_seen(model: Model, path: Path) -> int | None:
     """Steps x batch size, which is images of each modality. None if it started from weights, or rows are not known."""
-    run, steps = model.run, model.run.steps
+    run = model.run
     started = run.init.digest or {run.encoder[m].weights for m in model.encoders} != {SCRATCH}
-    if started or not (steps or (path / FILE).exists()):
+    if started or not (run.steps or (path / FILE).exists()):
         return None
-    if not steps:
-        steps = run.num_steps(sum(len(source.ids) for source in read_sources(path) or ()))
+    steps = run.steps or run.num_steps(sum(len(source.ids) for source in read_sources(path) or ()))
     return steps * run.batch_size

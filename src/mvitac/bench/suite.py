@@ -103,9 +103,8 @@ class Suite:
 
     def definition(self) -> dict[str, Any]:
         value = to_json(self)
-        for one in value["sets"]:
-            for form in one["forms"]:
-                del form["pins"]
+        for form in (form for one in value["sets"] for form in one["forms"]):
+            del form["pins"]
         return value
 
     def digest(self) -> str:

@@ -130,8 +130,7 @@ class DataSpec:
                 raise ValueError(f"task {name!r} occurs twice: give each task its own name")
         units: dict[str, str] = {}
         for target in (target for task in self.values for target in task.targets):
-            if units.setdefault(target.name, target.unit) != target.unit:
-                unit = units[target.name]
+            if (unit := units.setdefault(target.name, target.unit)) != target.unit:
                 raise ValueError(f"{target.name!r} has two units, {unit} and {target.unit}: give a column one unit")
 
     @property
