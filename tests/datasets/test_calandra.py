@@ -39,9 +39,8 @@ def write_shard(
     folder: Path, shard: int, objects: Sequence[bytes | str | None], *, leak: bool = False, grip: Any = None
 ) -> Path:
     """One shard in the owners' structure: /data/iN with nine images each, name and outcome as attributes of iN.
-
-    ``leak``: the image 'after' shows the outcome and the others do not. ``grip`` replaces the outcome (None = i % 2).
-    """
+    ``leak``: the image 'after' shows the outcome and the others do not. ``grip`` replaces the outcome (None = i %
+    2)."""
     path = folder / f"calandra_corl2017_{shard:03d}.h5"
     rng = np.random.default_rng(shard)
     with h5py.File(path, "w") as file:

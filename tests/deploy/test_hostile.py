@@ -63,10 +63,8 @@ def forge(
     probes: dict[str, torch.Tensor] | None = None,
     files: dict[str, bytes] | None = None,
 ) -> None:
-    """Change the artifact or export in ``folder``, and make every digest fit again.
-
-    {trap} in ``run``, that of the header of model.safetensors, stands for the trap beside the folder.
-    """
+    """Change the artifact or export in ``folder``, and make every digest fit again. {trap} in ``run``, that of the
+    header of model.safetensors, stands for the trap beside the folder."""
     file = folder / "model.safetensors"
     if run or stored:
         with safetensors.safe_open(file, "pt") as opened:

@@ -335,8 +335,7 @@ def test_the_command_shows_few_labels(smoke_run: Path, tmp_path: Path, capsys: p
         assert len(sizes) == 1  # the same test rows
         assert records[source, "10 % of labels"]["accuracy"] < records[source, "linear"]["accuracy"] + 0.1
     for words, says in (("101", "fractions (101.0,): give"), ("33.33331 33.33332", "labels' is given twice")):
-        assert main(["probe", str(smoke_run), "--fractions", *words.split()]) == 2
-        assert says in capsys.readouterr().err
+        assert main(["probe", str(smoke_run), "--fractions", *words.split()]) == 2 and says in capsys.readouterr().err
 
 
 def test_a_thumbnail_is_the_mean_of_its_pixels_and_the_border_sees_nothing_of_the_middle() -> None:

@@ -141,8 +141,7 @@ def test_a_row_may_not_read_other_values(tmp_path: Path) -> None:
     text = build(altered(Toy(), lambda *_: {column: "a"}), tmp_path / "text", size=32, quiet=True)
     rows = (Row(label="MViTac"), *(Row(label=p.path.name, set={"data.path": str(p.path)}) for p in (other, text)))
     work = lay_out(small(pack, rows=rows, seeds=1), pack, tmp_path / "out", ProbeConfig())
-    for label in ("other", "text"):
-        assert f"another column {column}" in work.left_out[label]
+    assert all(f"another column {column}" in work.left_out[label] for label in ("other", "text"))
 
 
 def test_scores_that_were_copied_from_another_run_are_computed_again(

@@ -279,9 +279,7 @@ def sources(
 
 def _engine(model: str, threads: int, modalities: tuple[Any, ...] = (), *, most: int = 2) -> Engine:
     """The engine of an export; a run or an artifact is exported first, once, into the cache, with these inputs.
-
-    ValueError if it has more than ``most`` inputs.
-    """
+    ValueError if it has more than ``most`` inputs."""
 
     def check(inputs: Iterable[str]) -> None:
         if len([*inputs]) > most:

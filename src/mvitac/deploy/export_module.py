@@ -143,10 +143,8 @@ def output_of(probe: LinearProbe) -> str:
 
 
 def _filter(size: int, stored: int) -> Tensor:
-    """[size, stored]: antialiased bilinear resizing is linear along each axis, so it is one matrix, the resized identity.
-
-    Rounded to the 16-bit fixed-point weights of torch's uint8 kernel, so that every pixel is the same.
-    """
+    """[size, stored]: antialiased bilinear resizing is linear along each axis, so it is one matrix, the resized
+    identity. Rounded to the 16-bit fixed-point weights of torch's uint8 kernel, so that every pixel is the same."""
     rows = F.interpolate(torch.eye(stored)[None, None], (size, stored), mode="bilinear", antialias=True)[0, 0]
     step = 2.0 ** max(p for p in range(24) if (rows.max() * 2**p).round() < 2**15)
     return (rows * step).round() / step

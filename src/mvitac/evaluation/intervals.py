@@ -142,10 +142,8 @@ class _Variance:
 
 
 def _over_groups(correct: np.ndarray, sizes: np.ndarray) -> _Variance:
-    """Variance of sum(correct) / sum(sizes) over groups, from [G] and [G].
-
-    Unbiased, with Bell and McCaffrey's (2002) degrees of freedom, if groups vary alike: G - 1, fewer if sizes differ.
-    """
+    """Variance of sum(correct) / sum(sizes) over groups, from [G] and [G]. Unbiased, with Bell and McCaffrey's (2002)
+    degrees of freedom, if groups vary alike: G - 1, fewer if sizes differ."""
     w = sizes / sizes.sum()
     squares = float(w @ w)
     share = w * w / np.maximum(1 - 2 * w + squares, 1e-12)
@@ -193,10 +191,8 @@ def _margin(groups: _Variance, seeds: _Variance) -> float:
 
 
 def _margin_and_p(mean: float, groups: _Variance, seeds: _Variance, num_groups: int) -> tuple[float, float]:
-    """``_margin`` and p of a mean that 0 is compared with: where p is always above .05, the interval has 0 in it.
-
-    Two groups of equal gaps would otherwise give an interval of no width.
-    """
+    """``_margin`` and p of a mean that 0 is compared with: where p is always above .05, the interval has 0 in it. Two
+    groups of equal gaps would otherwise give an interval of no width."""
     p = max(_p(mean, groups + seeds), _p(mean, seeds) if seeds.value else 0, least_p(num_groups))
     return max(_margin(groups, seeds), abs(mean) if least_p(num_groups) > 0.05 else 0), p
 

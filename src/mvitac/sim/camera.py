@@ -57,10 +57,8 @@ class View:
 
 
 def _clutter(azimuth: float, rng: np.random.Generator) -> np.ndarray:
-    """Draw poses [clutter, 7] behind the gripper or at its side, seen from ``azimuth``: nothing hides the object.
-
-    A pose is position and quaternion; absent objects are far below the table.
-    """
+    """Draw poses [clutter, 7] behind the gripper or at its side, seen from ``azimuth``: nothing hides the object. A
+    pose is position and quaternion; absent objects are far below the table."""
     poses = np.zeros((len(objects.CLUTTER), 7))
     for pose in poses:
         where, far = azimuth + np.pi + rng.uniform(-1.15, 1.15), rng.uniform(0.15, 0.30)

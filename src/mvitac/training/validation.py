@@ -130,9 +130,7 @@ def _linear(
 
 def _answers(pack: Pack, task: AnyTask, split: str, rows: np.ndarray) -> list[Tensor]:
     """What a probe fits: one column per class of a task, or one column for each value on its own; NaN = not known.
-
-    Values are standardised, which changes no R2, so that float32 holds them.
-    """
+    Values are standardised, which changes no R2, so that float32 holds them."""
     if not isinstance(task, Task):
         every = pack.values(task)
         scaled = (pack.values(task, split)[rows] - np.nanmean(every, axis=0)) / (np.nanstd(every, axis=0) + 1e-100)

@@ -33,10 +33,8 @@ TEST, VAL = (3, 8, 13, 18), (4, 9)
 
 @dataclass
 class Presses(Source):
-    """20 objects of 3 materials, each filmed and touched for 16 frames in which it slides at varying speed.
-
-    A camera sees its texture on a brown table, a gel of blue and red light its bump. ``fault`` breaks one thing.
-    """
+    """20 objects of 3 materials, each filmed and touched for 16 frames in which it slides at varying speed. A camera
+    sees its texture on a brown table, a gel of blue and red light its bump. ``fault`` breaks one thing."""
 
     fault: str = ""
 

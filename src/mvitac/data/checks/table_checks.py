@@ -110,10 +110,8 @@ def noted(pack: Pack) -> list[Finding]:
 
 
 def _predicts(what: str, task: str, values: np.ndarray, labels: np.ndarray) -> list[str]:
-    """Return a note if the most frequent label of each value is right for more rows than the majority class.
-
-    Ten points more, and more than with each of 99 random orders of the values (p = .01).
-    """
+    """Return a note if the most frequent label of each value is right for more rows than the majority class. Ten points
+    more, and more than with each of 99 random orders of the values (p = .01)."""
 
     def right(values: np.ndarray) -> int:
         return contingency_matrix(values, labels, sparse=True).max(1).sum()
