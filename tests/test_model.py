@@ -186,7 +186,6 @@ def test_trunk_of_two_sensors_has_six_channels(tmp_path: Path) -> None:
 
 
 def test_models_can_be_copied_and_pickled(model: Model, pack: Pack) -> None:
-    """scikit-learn and ``torch.multiprocessing`` do."""
     expected = model.predict(touch=pack.images["touch"][:3])
     for twin in (copy.deepcopy(model), pickle.loads(pickle.dumps(model))):
         assert repr(twin) == repr(model)

@@ -23,7 +23,6 @@ from support.toy import with_columns
 
 
 def test_paper_constants() -> None:
-    """Appendix A and B as printed."""
     run = recipe("paper")
     assert (run.batch_size, run.epochs, run.augment.size) == (256, 240, 224)
     assert (run.optim.name, run.optim.lr, run.optim.eps) == ("adam", 0.03, 1e-7)
@@ -119,7 +118,6 @@ def test_recipe_of_grasps(name: str, file: str, grasps: Path, tmp_path: Path, mo
 
 
 def test_rows_with_other_phases_are_no_grasps(pack: Pack) -> None:
-    """Only the moments of a grasp count, whatever a table calls a phase."""
     for values, phased in ((["before", "during"], True), (["during", "during"], True), (["pressed", "during"], False)):
         assert with_columns(pack, phase=values * (pack.num // 2)).phased is phased
     assert not pack.phased

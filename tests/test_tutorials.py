@@ -60,7 +60,6 @@ def test_every_cell_runs(page: Path, tmp_path: Path) -> None:
 
 
 def test_later_pages_run(artifact: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the folder that "Your own sensor" leaves."""
     monkeypatch.chdir(tmp_path)
     Path("artifacts").mkdir()
     Path("artifacts/mine").symlink_to(artifact)

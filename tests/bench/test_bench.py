@@ -242,7 +242,6 @@ def test_folds_test_every_group_once(root: Path, results: list[Path]) -> None:
 
 
 def test_a_model_that_saw_the_test_groups_is_marked_and_not_ordered(results: list[Path], tmp_path: Path) -> None:
-    """The run learned from the train split, whose groups the folds test."""
     read = {r["encoder"]["name"]: r for r in map(read_result, results)}
     blocks = next(iter(read.values()))["blocks"]
     assert blocks[0]["leaks"] == [""] and "72 of 120 test rows and 36 of 60 test instances" in blocks[2]["leaks"][0]
@@ -470,7 +469,6 @@ FORGED: dict[str, tuple[Change, str]] = {
 
 @pytest.mark.parametrize("kind", FORGED)
 def test_forgery_is_refused(kind: str, results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """It was signed again by someone who wants to hide what was changed."""
     change, words = FORGED[kind]
     forged = changed(results[0], tmp_path / "a.json", change, signed=True)
     for command in ("check", "board"):

@@ -58,7 +58,6 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def snapshot(folder: Path) -> dict[str, str]:
-    """Every file and folder below ``folder`` with a digest of its bytes."""
     return {str(p.relative_to(folder)): digest_file(p) if p.is_file() else "folder" for p in folder.rglob("*")}
 
 
@@ -238,7 +237,6 @@ def leaves(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
 
 
 def test_a_record_with_a_field_of_the_wrong_type(refused: Callable[..., str], finished: Path, tmp_path: Path) -> None:
-    """An object where a value belongs, for every value of a run."""
     for leaf in leaves(to_json(recipe("smoke", PackConfig(), phased=False))):
         edited(Path(shutil.copy(finished / "run.json", tmp_path)), ("run", *leaf), {"surprise": 1})
         refused("pretrain --from {tmp}/run.json --out {out}", "run.json", leaf[-1])

@@ -199,7 +199,6 @@ def test_an_episode_is_one_recording_of_a_group(pack: Pack) -> None:
 
 
 def test_episodes_that_say_nothing(pack: Pack) -> None:
-    """Touch that is not there is black, and actions that never change have no scale: both were "does not use touch"."""
     for word in ("maybe", "nan"):
         with pytest.raises(ValueError, match=f"column contact has '{word}': give yes or no"):
             read_episodes(with_columns(pack, contact=["no"] * (pack.num - 1) + [word]))

@@ -260,7 +260,6 @@ def test_rows(small: Servo) -> None:
 
 
 def test_the_suite_shows_what_was_measured() -> None:
-    """Mean levels: another processor rounds a pixel otherwise, another scene does not come near."""
     levels = {"straight": [87.89, 103.34], "curved": [86.86, 102.87]}
     levels |= {"corner": [104.79, 107.80], "surface": [133.27, 112.03]}
     for kind in KINDS:

@@ -21,7 +21,6 @@ SIDE = 16
 
 
 def written(kind: str, folder: Path) -> Path:
-    """A picture of 24 x 20 pixels, without symmetry, as a file of this kind."""
     rng = np.random.default_rng(5)
     rgb = rng.integers(0, 256, (20, 24, 3), dtype=np.uint8)
     path = folder / "touch.png"

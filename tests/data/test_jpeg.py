@@ -107,7 +107,6 @@ def test_the_command_line_and_the_cache(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 def lengths(change: Callable[[np.ndarray], pa.Array | None]) -> Callable[[Path], None]:
-    """Column bytes_touch otherwise, or away; consistently sealed."""
 
     def spoil(path: Path) -> None:
         table = pq.read_table(path / "samples.parquet")
@@ -186,7 +185,6 @@ def test_trains_as_on_the_same_pixels_raw(small: Pack, decoded: Pack, tmp_path: 
 
 
 def test_decoding_runs_ahead_of_the_step(small: Pack, decoded: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a thread for JPEGs; a raw pack's views are made where they are used, as ever."""
     import threading
 
     makers: list[str] = []

@@ -64,13 +64,15 @@ def test_one_task_if_classes_agree_else_two(pack: Pack, gel: Pack) -> None:
     assert [task.name for task in mix.spec.tasks] == ["pattern", "toy/bright", "gel/bright"]
     assert mix.spec.tasks[0].classes == pack.spec.tasks[0].classes
     expected = np.concatenate([pack.labels("pattern"), (gel.labels("pattern") - 1) % 3])
+    mix.labels("pattern")[:] = 0  # of a copy
     np.testing.assert_array_equal(mix.labels("pattern"), expected, "classes go by name")
     for name, part, first in (("toy/bright", pack, 0), ("gel/bright", gel, pack.num)):
         expected = np.full(mix.num, -1)
         expected[first : first + part.num] = part.labels("bright")
         np.testing.assert_array_equal(mix.labels(name), expected)
-    assert mix.spec.controls == {"noise only": ("control/noise",)}  # a column of this name is no control in gel
-    np.testing.assert_array_equal(np.isfinite(mix.column("control/noise")), mix.column("part") == "toy")
+    ((name, (column,)),) = mix.spec.controls.items()
+    assert (name, column) == ("noise only", "control/noise only/noise")  # a column of this name is no control in gel
+    np.testing.assert_array_equal(np.isfinite(mix.column(column)), mix.column("part") == "toy")
 
 
 def test_a_control_of_one_part_is_no_value_of_another(gel: Pack, tmp_path: Path) -> None:
@@ -80,13 +82,29 @@ def test_a_control_of_one_part_is_no_value_of_another(gel: Pack, tmp_path: Path)
     (task,) = mix.spec.values
     inside = mix.column("part") == "a"
     np.testing.assert_array_equal(np.isfinite(mix.values(task)[:, 0]), inside)
-    assert mix.spec.controls["force"] == ("control/force",)
-    np.testing.assert_array_equal(mix.column("control/force")[~inside], 1000.0 * np.arange(30))
-    assert np.isnan(mix.column("control/force")[inside]).all()
+    assert mix.spec.controls["force"] == ("control/force/force",)
+    np.testing.assert_array_equal(mix.column("control/force/force")[~inside], 1000.0 * np.arange(30))
+    assert np.isnan(mix.column("control/force/force")[inside]).all()
+
+
+def test_a_column_is_of_the_task_and_the_control_that_name_it(tmp_path: Path) -> None:
+    """Here z is a depth, a control called near; there it is a height, a control called far."""
+    parts = {}
+    for k, (name, control) in enumerate((("depth", "near"), ("height", "far"))):
+        task = ValueTask(name=name, targets=(Target(name="z", unit="mm"),))
+        toy = altered(
+            Slice(num=30, first=60 * k), lambda _, i: {"z": i / 2}, values=(task,), controls={control: ("z",)}
+        )
+        parts[name] = built(toy, tmp_path / name)
+    mix = MixedPack(parts)
+    assert [task.name for task in mix.spec.values] == ["depth/depth", "height/height"]
+    for task, columns in zip(mix.spec.values, mix.spec.controls.values(), strict=True):
+        inside = mix.column("part") == task.name.partition("/")[0]
+        for found in (mix.values(task)[:, 0], mix.column(columns[0])):
+            np.testing.assert_array_equal(np.isfinite(found), inside)
 
 
 def pressed(first: int = 0, unit: str = "N", kind: Any = 1, own_split: bool = False) -> Toy:
-    """The stripes with a force, in ``unit``, of one phase, and a split of their own for it."""
     extra = {"kind": kind, **({"split_force": "test"} if own_split else {})}
     split = "split_force" if own_split else "split"
     task = ValueTask(name="force", targets=(Target(name="force", unit=unit),), only={"kind": "1"}, split=split)

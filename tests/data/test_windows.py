@@ -60,7 +60,6 @@ def presses(tmp_path_factory: pytest.TempPathFactory) -> Pack:
 
 
 def shown(pack: Pack, touch: int, frame: int, modality: str = "touch") -> list[int]:
-    """The frame numbers that the row of this frame shows."""
     (row,) = np.flatnonzero((pack.column("touch_group") == f"t{touch}") & (pack.column("frame") == frame))
     return ((pack.images[modality][row][0, 0, ::3].astype(int) - 10 - 20 * touch) // 2).tolist()
 

@@ -31,7 +31,6 @@ OBJECTS = ("lemon", "lime", "potato", "onion", "soft_zebra", "metal_can", "some_
 
 
 def pixel(shard: int, index: int, sensor: int, phase: int) -> int:
-    """Upper left pixel of an image of the fixture, different for every image of a grasp."""
     return (shard * 97 + index * 9 + sensor * 3 + phase) % 256
 
 

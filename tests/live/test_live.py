@@ -251,6 +251,9 @@ def test_sources_by_name(tmp_path: Path) -> None:
         frame = stream.newest()
         seen.append(frame.image[0, 0, 0] if frame else None)
     assert seen == [0, 0, 20, 20] and stream.num_damaged == 1 and isinstance(source("sim:3", "vision"), Simulated)
+    stream.take(buffer := np.full((4, 6, 3), 7, np.uint8))
+    buffer[:] = 8  # as a driver that has one
+    assert (last := stream.newest()) and (last.image == 7).all()
     wrong = {"nothing": "'nothing': give a video", "sim:-3": "'-3' is no seed", "0#0:0:-5:9": "give the part as"}
     for text, says in (wrong | {f"{tmp_path}@fast": "'fast' is no"}).items():
         with pytest.raises(ValueError, match=says):

@@ -160,7 +160,6 @@ def test_weights_that_do_not_fit_are_refused(kind: str, state: State, tmp_path: 
 
 
 def test_positions_of_another_size_are_those_that_timm_makes(tmp_path: Path) -> None:
-    """timm knows the names and positions of its owners' files."""
     torch.manual_seed(0)
     large = timm.create_model("test_vit", img_size=160)
     with pytest.raises(ValueError, match="left over"):  # two sets of weights, of which timm would take the second

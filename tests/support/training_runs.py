@@ -50,7 +50,6 @@ def batches(run: Run, pack: Pack, rows: np.ndarray, start: int, num_steps: int) 
 
 
 def views_by(feed: type[ImageLoader], run: Run, pack: Pack, rows: np.ndarray, num_views: int = 2) -> Views:
-    """Views of ``rows`` on the CPU, with images from ``feed``."""
     made = StepViews(run, pack, num_views, torch.device("cpu"))
     made.images = feed(pack, made.device)
     return made.make(rows, 0)

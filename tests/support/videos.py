@@ -15,7 +15,6 @@ COLOURS = {"vision": (220, 60, 40), "touch": (40, 90, 220)}
 
 
 def picture(path: Path, colour: int | tuple[int, int, int] = 0, size: tuple[int, int] = (16, 16)) -> Path:
-    """A picture of one gray or colour, in a folder that need not be there."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.new("RGB", size, (colour,) * 3 if isinstance(colour, int) else colour).save(path, quality=95)
     return path

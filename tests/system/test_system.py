@@ -83,7 +83,6 @@ def test_nothing_is_shown_unasked(capsys: pytest.CaptureFixture[str], monkeypatc
 
 @pytest.fixture
 def two_threads() -> Iterator[None]:
-    """Torch with two threads, as on a machine of two cores."""
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     yield

@@ -22,7 +22,6 @@ pytestmark = pytest.mark.slow
 
 
 def together(folder: Path, *words: str, num: int = 2, fails: bool = False) -> None:
-    """Run the worker in ``num`` processes that find each other as torchrun's would."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])

@@ -115,7 +115,6 @@ def test_a_log_ends_before_what_is_none(tmp_path: Path) -> None:
 
 
 def test_killed_between_two_checkpoints(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
-    """The old one has moved away, the new one is not there yet."""
     run = cut_after(5, pack, tmp_path / "r")
     os.replace(tmp_path / "r" / CHECKPOINT, tmp_path / "r" / PREVIOUS)
     with power_cut(4):  # steps 5 to 8 and no more

@@ -77,7 +77,8 @@ def measure(
     old: dict[str, Any] = read_signed(path, form) if path.exists() else {"encoder": encoder}
     for key in ("name", "weights"):
         if (of := old["encoder"][key]) != encoder[key]:
-            raise ValueError(f"{path} is the result of other {key} ({str(of)[:14]}): give --name, or another --out")
+            theirs = of if key == "name" else of[0][:12]
+            raise ValueError(f"{path} is the result of other {key} ({theirs}): give --name, or another --out")
     if old.get("suite_digest", suite.digest()) != suite.digest():
         raise ValueError(f"{path} is the result of another suite {suite.name!r}: rename it, or give another --out")
     start = time.perf_counter()

@@ -66,10 +66,8 @@ def pretrain(argv: list[str]) -> None:
 
 
 def _chosen_run(chosen: dict[str, str], rest: list[str], phased: bool) -> Run:
-    """The run before single fields are changed: a recorded one, or a recipe with its data and method.
-
-    ``phased`` is for data that does not know it before it is opened. ``--epochs`` in ``rest`` replaces the recipe's steps.
-    """
+    """The run before single fields are changed: a recorded one, or a recipe with its data and method. ``phased`` is for
+    data that does not know it before it is opened. ``--epochs`` in ``rest`` replaces the recipe's steps."""
     if "--from" in chosen:
         for name in ("--method", "--data", "--recipe"):
             if name in chosen:

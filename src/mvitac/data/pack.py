@@ -131,7 +131,7 @@ class Pack:
             if splits:
                 known[~np.isin(self.column(task.split), splits)] = nothing
             self._answers[key] = known
-        return self._answers[key]
+        return self._answers[key].copy()  # callers may change it
 
     def answered(self, task: AnyTask, *splits: str) -> np.ndarray:
         """Return bool [N], which rows (of ``splits``) have a label, or a value of at least one target."""

@@ -141,10 +141,17 @@ def _shared_by_parts(parts: Mapping[str, Pack]) -> str:
 
 
 def _mixed_tasks(parts: Mapping[str, Pack]) -> dict[str, Tasks]:
-    """The tasks of each part. Those of one name that mean the same are one; others become <part>/<name>."""
+    """The tasks of each part. Those of one name that mean the same are one; others become <part>/<name>.
+
+    So do values of a column that another part measures for a task of another name: a mix has one column of each name.
+    """
     tasks = [task for pack in parts.values() for task in pack.spec.all_tasks]
     first = {task.name: task for task in reversed(tasks)}
     shared = {name for name in first if len({_meaning(task) for task in tasks if task.name == name}) == 1}
+    for pack, task in itertools.product(parts.values(), first.values()):
+        columns = {target.name for own in pack.spec.values for target in own.targets}
+        if isinstance(task, ValueTask) and task.name not in {own.name for own in pack.spec.values}:
+            shared -= {task.name for target in task.targets if target.name in columns}
     return {
         part: {t.name: first[t.name] if t.name in shared else _of_part(part, t) for t in pack.spec.all_tasks}
         for part, pack in parts.items()
@@ -172,7 +179,8 @@ def _mixed_spec(parts: Mapping[str, Pack], tasks: Mapping[str, Tasks], notes: Se
     for part, spec in specs.items():
         for name, columns in spec.controls.items():
             alike = all(other.controls.get(name, columns) == columns for other in specs.values())
-            controls[name if alike else f"{part}/{name}"] = tuple(map(_CONTROL.format, columns))
+            own = name if alike else f"{part}/{name}"
+            controls[own] = tuple(_CONTROL.format(own, column) for column in columns)
     return DataSpec(
         name=f"mix of {', '.join(specs)}",
         vision_channels=max(spec.vision_channels for spec in specs.values()),
@@ -188,7 +196,7 @@ def _mixed_spec(parts: Mapping[str, Pack], tasks: Mapping[str, Tasks], notes: Se
     )
 
 
-_CONTROL = "control/{}"
+_CONTROL = "control/{}/{}"
 """A mix's column of a control, which in another part may be measured values."""
 OWN = re.compile(r"(id|group|touch_group|press|part|sensor|(has|crc|bytes|label)_.*)")
 """Columns that a mix does not take over as they are."""
@@ -219,7 +227,10 @@ def _mixed_columns(part: str, parts: Mapping[str, Pack], tasks: Tasks, mixed: Da
     numbers = [column for used in mixed.controls.values() for column in used]
     numbers += [target.name for task in mixed.values for target in task.targets]
     columns |= dict.fromkeys(numbers, pa.array(np.full(pack.num, np.nan)))
-    measured = {_CONTROL.format(column): column for used in pack.spec.controls.values() for column in used}
+    measured: dict[str, str] = {}
+    for name, used in pack.spec.controls.items():
+        own = name if name in mixed.controls else f"{part}/{name}"
+        measured |= {_CONTROL.format(own, column): column for column in used}
     for task in pack.spec.values:
         own = tasks[task.name]
         assert isinstance(own, ValueTask)

@@ -93,10 +93,8 @@ def export(
 
 
 def _checked(path: Path, precision: str, check: Callable[[Call], Any]) -> tuple[Runtime, Call, dict[str, Any]]:
-    """The first runtime whose outputs are those of the model, and the report of its ``check``.
-
-    OpenVINO 2026.4 computes some int8 networks wrongly, such as a ResNet whose features are means of all its stages.
-    """
+    """The first runtime whose outputs are those of the model, and the report of its ``check``. OpenVINO 2026.4 computes
+    some int8 networks wrongly, such as a ResNet whose features are means of all its stages."""
     runtimes: dict[str, tuple[Runtime, ...]] = {"bf16": ("openvino",), "int8": ("auto", "onnxruntime")}
     trouble = ""
     for runtime in runtimes.get(precision, ("auto",)):
@@ -191,9 +189,8 @@ def _error(
     pack: Pack, rows: np.ndarray, target: dict[str, Any], wanted: np.ndarray, found: np.ndarray, limit: float
 ) -> dict[str, Any]:
     """What an export does to one target, in its unit; ValueError if values change by more than ``limit`` deviations.
-
-    The deviation is that of the measured values, or of the model's own where fewer than two were measured in this unit.
-    """
+    The deviation is that of the measured values, or of the model's own where fewer than two were measured in this
+    unit."""
     name, unit, true = target["name"], target["unit"], np.full(len(rows), np.nan)
     for task in pack.spec.values:
         for t, known in enumerate(task.targets):

@@ -118,10 +118,8 @@ def _counts(records: Sequence[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _shares(record: dict[str, Any], sizes: np.ndarray) -> np.ndarray:
-    """Each group's share in R2, times the number of rows: [G], with sum R2 * rows.
-
-    It comes from R2 without the group (the jackknife). For an accuracy the same formula gives the correct rows.
-    """
+    """Each group's share in R2, times the number of rows: [G], with sum R2 * rows. It comes from R2 without the group
+    (the jackknife). For an accuracy the same formula gives the correct rows."""
     if np.count_nonzero(sizes) < 2:
         return record["r2"] * sizes
     shares = sizes * record["r2"] + (sizes.sum() - sizes) * (record["r2"] - r2_without_each_group(record))

@@ -131,7 +131,7 @@ class Stream:
 
     def take(self, image: np.ndarray) -> None:
         """Make ``image`` the newest frame, captured when its source says, or now."""
-        now, before = self.clock(), self._newest
+        now, before, image = self.clock(), self._newest, image.copy()  # a source may fill one buffer again and again
         captured = now if self.origin.captured is None else self.origin.captured
         changed = before and before.image.shape != image.shape
         if self.fault in ("unplugged", "stalled"):

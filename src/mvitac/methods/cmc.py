@@ -100,10 +100,8 @@ class CMC(Contrastive, config=CMCConfig):
         return {"loss": vt + tv, "vt": vt, "tv": tv}
 
     def _contrast(self, query: Tensor, bank: Bank, at: Tensor, fixed: Tensor) -> tuple[Tensor, Tensor]:
-        """The loss of one direction, and its normalisation constant Z, for embeddings ``query`` [B, D].
-
-        ``at`` [B, K + 1] are rows of ``bank``, the other modality's; column 0 is the positive. ``fixed``: Z of earlier ones.
-        """
+        """The loss of one direction, and its normalisation constant Z, for embeddings ``query`` [B, D]. ``at`` [B, K +
+        1] are rows of ``bank``, the other modality's; column 0 is the positive. ``fixed``: Z of earlier ones."""
         logits = bank.dots(query, at) / self.config.temperature
         if self.config.softmax:
             return F.cross_entropy(logits, torch.zeros_like(at[:, 0])), fixed

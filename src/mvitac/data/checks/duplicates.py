@@ -115,9 +115,7 @@ def _near_pairs(
     residuals: Residuals, asked: np.ndarray, bank: np.ndarray, groups: np.ndarray, exact: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Pairs of rows [n, 2] that are near-duplicates, one of ``asked`` and one of ``bank``, the most similar first.
-
-    Exact copies are left out. Also returns how common near-duplicates are between groups of ``bank``.
-    """
+    Exact copies are left out. Also returns how common near-duplicates are between groups of ``bank``."""
     best, value = residuals.nearest(asked, bank, apart=None)
     _, natural = residuals.nearest(_some(bank, 500), bank, apart=groups)
     near = float(np.clip((1 + natural.max()) / 2, NEAR_AT_LEAST, NEAR)) if natural.max() > -1 else NEAR
