@@ -346,9 +346,8 @@ def test_a_thumbnail_is_the_mean_of_its_pixels_and_the_border_sees_nothing_of_th
 
     image = np.random.default_rng(0).integers(0, 255, (32, 32, 6), np.uint8)
     found = controls.thumbnails(pictures(image), "touch", np.array([0]), side=8)
-    assert np.allclose(
-        found[0], (image.reshape(8, 4, 8, 4, 6).mean((1, 3)) / 255).transpose(2, 0, 1).ravel(), atol=1e-6
-    )
+    blocks = image.reshape(8, 4, 8, 4, 6).mean((1, 3)) / 255
+    assert np.allclose(found[0], blocks.transpose(2, 0, 1).ravel(), atol=1e-6)
     plain = np.full((32, 32, 3), 7, np.uint8)
     middle, edge = plain.copy(), plain.copy()
     middle[4:-4, 4:-4] = 200

@@ -75,10 +75,9 @@ def measure(
     path = out / f"{slug(suite.name + '-' + encoder['name'])}.json"
     check_place(path)
     old: dict[str, Any] = read_signed(path, form) if path.exists() else {"encoder": encoder}
-    for key in ("name", "weights"):
-        if (of := old["encoder"][key]) != encoder[key]:
-            theirs = of if key == "name" else of[0][:12]
-            raise ValueError(f"{path} is the result of other {key} ({theirs}): give --name, or another --out")
+    name, weights = (old["encoder"][key] for key in ("name", "weights"))
+    if (name, weights) != (encoder["name"], encoder["weights"]):
+        raise ValueError(f"{path} is the result of {name!r}, weights {weights[0][:12]}: give --name, or another --out")
     if old.get("suite_digest", suite.digest()) != suite.digest():
         raise ValueError(f"{path} is the result of another suite {suite.name!r}: rename it, or give another --out")
     start = time.perf_counter()
