@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec, Target, listed
 from mvitac.methods.base import Method
-from mvitac.nn.encoders import num_features, timm_trunk
+from mvitac.nn.encoders import Seeded, num_features, timm_trunk
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.nn.weights import misfit, read_model, safetensors_digest, write_model
 from mvitac.registry import check_known, from_json, to_json
@@ -305,8 +305,8 @@ def weights_file(folder: Path, which: Which) -> Path:
 
 def fresh(run: Run, spec: DataSpec, stored: int) -> Model:
     """The model of ``run`` before training, initialised from its seed. Used as a control, and to load weights into."""
-    torch.manual_seed(run.seed)
-    return Model(run.method.build(spec, run.encoder), run, spec, stored)
+    with Seeded(run.seed):
+        return Model(run.method.build(spec, run.encoder), run, spec, stored)
 
 
 def load(path: str | Path, which: Which = "last") -> Model:
@@ -342,11 +342,10 @@ def load(path: str | Path, which: Which = "last") -> Model:
     # The file has all weights, so the empty model needs no pretrained ones, and no download.
     empty = run.fresh()
     # Check shapes before allocating: a damaged header may describe a network larger than the memory.
-    with torch.random.fork_rng(devices=[]):  # keep the caller's random state
-        with torch.device("meta"):
-            if why := misfit(fresh(empty, spec, stored).state_dict(), tensors):
-                raise ValueError(f"{file} holds other weights than its run describes: {why}")
-        model = fresh(empty, spec, stored)
+    with torch.device("meta"):
+        if why := misfit(fresh(empty, spec, stored).state_dict(), tensors):
+            raise ValueError(f"{file} holds other weights than its run describes: {why}")
+    model = fresh(empty, spec, stored)
     model.foreign = foreign
     if model.foreign and run.init:
         run = replace(run, init=replace(run.init, path=None, digest=run.init.digest or "unknown"))

@@ -1,6 +1,7 @@
 """Convolutions and ViTs against closed forms, plain torch and timm; a loss under autocast."""
 
 import copy
+from threading import Thread
 from unittest.mock import patch
 
 import pytest
@@ -11,7 +12,7 @@ from timm.layers.conv2d_same import Conv2dSame
 from timm.models.vision_transformer import VisionTransformer
 from torch import nn
 
-from mvitac.nn.encoders import SCRATCH, EncoderConfig, build_trunk, sin_cos_positions
+from mvitac.nn.encoders import SCRATCH, EncoderConfig, Seeded, build_trunk, sin_cos_positions
 from mvitac.nn.folded import folded
 from mvitac.nn.losses import info_nce
 from mvitac.nn.small_conv import DepthwiseConv2d, SmallMapConv2d, _Product, use_convolutions, use_products
@@ -24,6 +25,22 @@ def test_is_fp32_under_autocast() -> None:
     with torch.autocast("cpu", torch.bfloat16):
         inside = info_nce(q, k, 0.07)
     assert inside.dtype == torch.float32 and float(inside) == float(info_nce(q.float(), k.float(), 0.07))
+
+
+def test_seeded_draws_what_the_seed_gives_while_another_thread_draws() -> None:
+    def drawn() -> list[torch.Tensor]:
+        first, kept = nn.Linear(4, 4), torch.empty(9)
+        begun.append(Thread(target=torch.randn, args=(5,)))
+        begun[-1].start(), begun[-1].join()
+        nn.init.trunc_normal_(kept)
+        return [first.weight, kept, torch.randn(4), torch.randperm(9), F.dropout(kept), torch.bernoulli(kept.abs() / 2)]
+
+    begun: list[Thread] = []
+    with Seeded(3):
+        found = drawn()
+    with patch.object(Thread, "start"), patch.object(Thread, "join"), torch.random.fork_rng():
+        torch.manual_seed(3)
+        torch.testing.assert_close(found, drawn(), atol=0, rtol=0)
 
 
 @pytest.mark.parametrize(("name", "left"), [("tf_efficientnet_lite0", 0), ("resnet10t", 1)])

@@ -14,6 +14,7 @@ from timm.models import PretrainedCfg, register_model
 from timm.models.resnet import BasicBlock, ResNet
 from timm.models.vision_transformer import VisionTransformer
 from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
 from tyro.conf import Fixed
 
 from mvitac.data.spec import DataSpec
@@ -299,6 +300,24 @@ def draws_random_numbers(network: nn.Module) -> bool:
     """Whether ``network`` has any kind of dropout. Layers of torch and timm call its rate p, drop_prob or drop_rate."""
     rates = ("p", "drop_prob", "drop_rate")
     return any(isinstance(rate := getattr(m, name, 0), float) and rate > 0 for m in network.modules() for name in rates)
+
+
+class Seeded(TorchDispatchMode):
+    """Within it this thread draws, on a CPU, from a generator of ``seed``: not from torch's, which all threads share.
+
+    The numbers are those that ``torch.manual_seed(seed)`` gives.
+    """
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        self.drawn = {"generator": torch.Generator().manual_seed(seed)}
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if torch.Tag.nondeterministic_seeded not in func.tags:
+            return func(*args, **kwargs or {})
+        if all(argument.name != "generator" for argument in func._schema.arguments):
+            func = func.overloadpacket.generator
+        return func(*args, **self.drawn | (kwargs or {}))
 
 
 def build_towers(config: Encoders, spec: DataSpec, head: Callable[[int], nn.Module]) -> nn.ModuleDict:

@@ -77,7 +77,8 @@ def train(
     with hold_lock(out, busy, wait=False) if world.is_main else nullcontext():
         setup = set_up(run, out, world, quiet=quiet, pack=pack)
         if setup is not None:  # else the run is already finished
-            _loop(setup, out, quiet=quiet, loggers=loggers, validate=validate)
+            with torch.random.fork_rng(devices=[]):  # keep the caller's random state
+                _loop(setup, out, quiet=quiet, loggers=loggers, validate=validate)
     return out
 
 

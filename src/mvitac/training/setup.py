@@ -21,7 +21,7 @@ from mvitac.evaluation.features import features
 from mvitac.evaluation.sensors import sensors_of
 from mvitac.methods.base import Method
 from mvitac.model import Model, load
-from mvitac.nn.encoders import IMAGENET, SCRATCH, build_trunk
+from mvitac.nn.encoders import IMAGENET, SCRATCH, Seeded, build_trunk
 from mvitac.nn.imagenet import source
 from mvitac.registry import to_json
 from mvitac.run import Run, load_run, precision_of
@@ -223,10 +223,10 @@ def _build_method(
     """The method of ``run`` with fresh or start weights, on ``device``, and what was taken of ``start``."""
     if device.type == "cpu":
         keep_freed_memory()
-    torch.manual_seed(run.seed)
-    method = run.method.build(pack.spec, run.encoder)
-    taken = load_start(start, method) if start else {}
-    method.prepare(torch.from_numpy(rows))
+    with Seeded(run.seed):
+        method = run.method.build(pack.spec, run.encoder)
+        taken = load_start(start, method) if start else {}
+        method.prepare(torch.from_numpy(rows))
     method.learn_scale(values_of(run, pack, rows))
     method.to(device).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     _check_trunks(method, run, pack)
