@@ -129,9 +129,7 @@ def live(argv: list[str]) -> None:
 
 def _run(loop: Live, seconds: float | None) -> OSError | None:
     """Print every prediction and release until all streams ended, ``seconds`` are over, Ctrl-C or SIGTERM.
-
-    Every stream is read in a thread of its own. Return why stdout took no more, if so.
-    """
+    Every stream is read in a thread of its own. Return why stdout took no more, if so."""
     start, news, failed = loop.clock(), threading.Event(), None
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: what was recorded becomes a pack
     threads = [CaptureThread(stream, news.set) for stream in loop.all]
@@ -278,8 +276,7 @@ def sources(
 
 
 def _engine(model: str, threads: int, modalities: tuple[Any, ...] = (), *, most: int = 2) -> Engine:
-    """The engine of an export; a run or an artifact is exported first, once, into the cache, with these inputs.
-    ValueError if it has more than ``most`` inputs."""
+    """The engine of an export, of at most ``most`` inputs; a run or an artifact is exported first, once, into the cache."""
 
     def check(inputs: Iterable[str]) -> None:
         if len([*inputs]) > most:

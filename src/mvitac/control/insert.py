@@ -8,8 +8,7 @@ a shroud hides the peg from it.
 Units: metres and radians inside, mm and degrees in names and results.
 """
 
-# mujoco is a binary module without stubs:
-# pyright: reportAttributeAccessIssue=false
+# pyright: reportAttributeAccessIssue=false  # mujoco is a binary module without stubs
 
 import math
 from collections.abc import Sequence

@@ -80,8 +80,7 @@ def recordings(pack: Pack, place: np.ndarray, *, distinct: bool = True) -> Itera
 
 
 def frames_of(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Row numbers of each row's frames [N, F], newest first; bool [N], whether its touch is long enough for all; and the
-    number [N] of the first row of its touch."""
+    """Rows of each row's frames [N, F], newest first; whether its touch is long enough [N]; the touch's first row [N]."""
     name, place = places(pack, window)
     back = window.stride * np.arange(window.frames)
     index, whole = np.zeros((pack.num, window.frames), np.int64), np.zeros(pack.num, bool)

@@ -179,8 +179,7 @@ def open_model(path: Path, engine: Runtime = "auto", precision: str = "fp32", th
 
 
 def _has_vnni() -> bool:
-    """Whether the CPU has instructions for 8-bit products. Without them OpenVINO 2026.4 now and then computes a wrong
-    int8 result (two threads, busy machine)."""
+    """Whether the CPU has instructions for 8-bit products; else OpenVINO 2026.4, on a busy machine, errs now and then."""
     flags = Path("/proc/cpuinfo")
     return "AVX2" not in os.environ.get("ONEDNN_MAX_CPU_ISA", "") and flags.exists() and "vnni" in flags.read_text()
 
@@ -203,8 +202,7 @@ def _core() -> Any:
     Each that compiles sets the stack that signals are handled on, and when it goes, the stack before: of two, that may be
     one that has gone, and Ctrl-C crashes.
     """
-    # OpenVINO reports its import to an analytics host and keeps an id in the home folder. A None here makes its telemetry
-    # fail to import; OpenVINO then does without.
+    # OpenVINO would report its import to an analytics host and keep an id in the home folder: without telemetry it cannot.
     sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
     import openvino
 

@@ -189,8 +189,7 @@ def _error(
     pack: Pack, rows: np.ndarray, target: dict[str, Any], wanted: np.ndarray, found: np.ndarray, limit: float
 ) -> dict[str, Any]:
     """What an export does to one target, in its unit; ValueError if values change by more than ``limit`` deviations.
-    The deviation is that of the measured values, or of the model's own where fewer than two were measured in this
-    unit."""
+    The deviation is that of the measured values, or of the model's own where under two were measured in this unit."""
     name, unit, true = target["name"], target["unit"], np.full(len(rows), np.nan)
     for task in pack.spec.values:
         for t, known in enumerate(task.targets):

@@ -48,8 +48,7 @@ class Recorder:
         time = columns["time"]
         if time < self._next or self.failed:
             return
-        # Counted from the last due time, not from this pair, as every delay would lower the rate. Pairs that were missed
-        # (at the start, in a gap) are not replaced by more later.
+        # From the last due time: from this pair, every delay would lower the rate. Missed pairs are not made up for later.
         self._next += self.every
         if time >= self._next:
             self._next = time + self.every

@@ -303,10 +303,7 @@ def draws_random_numbers(network: nn.Module) -> bool:
 
 
 class Seeded(TorchDispatchMode):
-    """Within it this thread draws, on a CPU, from a generator of ``seed``: not from torch's, which all threads share.
-
-    The numbers are those that ``torch.manual_seed(seed)`` gives.
-    """
+    """Within it this thread draws what ``torch.manual_seed(seed)`` gives on a CPU, but not from what all threads share."""
 
     def __init__(self, seed: int) -> None:
         super().__init__()

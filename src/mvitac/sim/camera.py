@@ -6,8 +6,7 @@ each grasp and independent of the outcome.
 Shapes: P rays (pixels times samples). Colours are linear RGB in [0, 1] until the last step. Units: metres, radians.
 """
 
-# mujoco is a binary module without stubs:
-# pyright: reportAttributeAccessIssue=false
+# pyright: reportAttributeAccessIssue=false  # mujoco is a binary module without stubs
 
 from typing import Any
 

@@ -213,8 +213,7 @@ def scene(thing: Thing) -> str:
 
 
 def _geoms(thing: Thing) -> str:
-    """Return the MJCF of the object's parts. They have priority 1. MuJoCo otherwise uses the larger friction of two
-    geoms, and the pad would hide the object's."""
+    """Return the MJCF of the object's parts. With priority 1 their friction counts, not the pad's, which is larger."""
     # A soft object's contact responds more slowly; MuJoCo limits the time constant to 2.5 time steps anyway.
     solref = f"{0.006 + 0.014 * thing.softness:.5f} 1"
     return "\n".join(

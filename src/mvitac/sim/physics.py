@@ -3,8 +3,7 @@
 Frames and units as in :mod:`mvitac.sim.objects`: metres, kilograms, newtons, radians, seconds.
 """
 
-# mujoco is a binary module without stubs:
-# pyright: reportAttributeAccessIssue=false
+# pyright: reportAttributeAccessIssue=false  # mujoco is a binary module without stubs
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -106,8 +106,7 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
             lr = run.optim.rate(at, num_steps, at // steps_per_epoch)
             losses = step(chunks, lr=lr, seed=combine_seeds(run.seed, at) + 1, progress=done / num_steps)
 
-            # Log the losses and check that they are finite, every log_every steps, as reading them waits for the GPU; and
-            # once early, so that the speed is known soon.
+            # Reading losses waits for the GPU: every log_every steps, and once early, so that the speed is known soon.
             report = last or done % run.log_every == 0 or done - start == EARLY < run.log_every
             if report:
                 values = {name: float(value) for name, value in losses.items()}
