@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags import rosbag1
 from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
 from mvitac.data.build import build
 from mvitac.data.images import ros_pixels
@@ -88,6 +90,24 @@ def test_messages_received_in_the_same_moment_are_not_one(tmp_path: Path, plugin
     assert pack.images["touch"][:, 0, 0, 0].tolist() == [*range(0, 150, 5)] * 3
     with pytest.raises(ValueError, match="0 has no image of /none"):
         RosbagConfig(path=tmp_path / "bags", touch=("/none",)).source()
+
+
+def test_a_bag_of_ros_1_beside_its_conversion_is_another_recording(tmp_path: Path) -> None:
+    kind, noetic = "sensor_msgs/msg/Image", get_typestore(Stores.ROS1_NOETIC)
+    with (
+        Writer(tmp_path / "run", version=9, storage_plugin=StoragePlugin.MCAP) as new,
+        rosbag1.Writer(tmp_path / "run.bag") as old,
+    ):
+        to = new.add_connection(GEL, kind, typestore=STORE)
+        came = old.add_connection(GEL, kind, typestore=noetic)
+        for i in range(20):
+            message = raw(i / 25, np.full((16, 20, 3), 5 * i, np.uint8), "rgb8")
+            new.write(to, START * 10**9 + i, STORE.serialize_cdr(message, kind))
+            header = noetic.types["std_msgs/msg/Header"](seq=i, stamp=message.header.stamp, frame_id="gel")
+            old.write(came, START * 10**9 + i, noetic.serialize_ros1(replace(message, header=header), kind))
+    pack = packed(RosbagConfig(path=tmp_path, touch=(GEL,), every=1), tmp_path / "pack")
+    assert pack.images["touch"][:, 0, 0, 0].tolist() == [*range(0, 100, 5)] * 2
+    assert pack.column("recording").tolist() == ["run"] * 20 + ["run.bag"] * 20
 
 
 @pytest.mark.parametrize(

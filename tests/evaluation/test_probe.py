@@ -321,8 +321,12 @@ def test_a_control_of_values_sees_as_few_labels(measured: Pack) -> None:
     pack = with_columns(measured, light=light)
     pack.spec = replace(pack.spec, controls={"light": ("light",)})
     found = {(r["source"], r["probe"]): r["r2"] for r in label_controls(pack, [task], (), ("linear", few_kind))}
-    assert found.keys() == {("mean", "linear"), ("light", "linear"), ("light", few_kind)}
+    assert found.keys() == {(source, kind) for source in ("mean", "light") for kind in ("linear", few_kind)}
     assert found["light", few_kind] < found["light", "linear"] > 0.5
+    rows, y = split_rows(pack, task), pack.values(task)[:, 0]
+    train, val = few(pack, task, rows.train, rows.val, 10, seed=0)
+    wrong = y[rows.test] - y[np.r_[rows.train[train], rows.val[val]]].mean()
+    assert found["mean", few_kind] == pytest.approx(1 - np.mean(wrong**2) / y[rows.test].var())
 
 
 def test_the_command_shows_few_labels(smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -95,7 +95,7 @@ class RosbagConfig(RecordedConfig):
             dropped += int((~good).sum())
             name = bag.relative_to(self.path).as_posix() if bag != self.path else bag.resolve().name
             for i in np.flatnonzero(good).tolist():
-                rows.append(recording_row(name.removesuffix(".bag"), i * every, float(own[i])) | cells[i])
+                rows.append(recording_row(name, i * every, float(own[i])) | cells[i])
                 for topic in cameras:
                     images[topic].append(Message(str(bag), topic, *at[topic][i]))
         note = f"topics are joined by time within {self.tolerance:g} s; {dropped} images without all others left out"

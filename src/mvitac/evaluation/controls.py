@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from mvitac.data.pack import Pack
 from mvitac.data.spec import MODALITIES, AnyTask, DataSpec, Task
 from mvitac.evaluation import probe
-from mvitac.evaluation.few_labels import percent_of
+from mvitac.evaluation.few_labels import few, percent_of
 from mvitac.evaluation.probe_config import Standardise
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.methods.simclr import SimCLRConfig
@@ -112,13 +112,19 @@ def label_controls(
         rows, whole = probe.split_rows(pack, task, modality), probe.split_rows(pack, task).all
         if modality != "none" and np.array_equal(rows.all, whole):
             continue
+        guess, linear, kinds = "mean", "curve", ["curve", *filter(percent_of, probes)]
         if isinstance(task, Task):
             guess, linear, kinds = "majority", "linear", probe.probes_of(task, probes)
-            answer = np.eye(len(task.classes))[np.bincount(pack.labels(task.name)[rows.fitted]).argmax()]
-        else:
-            guess, linear, kinds = "mean", "curve", ["curve", *filter(percent_of, probes)]
-            answer = np.nanmean(pack.values(task)[rows.fitted], axis=0)
-        found = [(guess, "linear", probe.score_rows(pack, task, rows.test, np.tile(answer, (len(rows.test), 1))))]
+        found = []
+        for kind in ("linear", *filter(percent_of, probes)):
+            train, val = few(pack, task, rows.train, rows.val, percent_of(kind) or 100, seed=0)
+            seen = np.concatenate([rows.train[train], rows.val[val]])
+            if isinstance(task, Task):
+                answer = np.eye(len(task.classes))[np.bincount(pack.labels(task.name)[seen]).argmax()]
+            else:
+                answer = np.nanmean(pack.values(task)[seen], axis=0)
+            guessed = np.tile(answer, (len(rows.test), 1))
+            found.append((guess, kind, probe.score_rows(pack, task, rows.test, guessed)))
         for name, columns in pack.spec.controls.items():
             x = np.stack([pack.column(column).astype(float) for column in columns], axis=1)
             if np.isfinite(x[whole]).all():  # else rows of a part of a mix that has no such control

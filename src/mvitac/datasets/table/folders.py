@@ -122,6 +122,9 @@ def list_videos(path: Path, names: Sequence[str], plain: str, every: int | None,
         at[first] = shown, np.zeros(len(shown))  # several may have one stamp
         apart = np.max([miss for _, miss in at.values()], axis=0)
         alone += int((apart > tolerance).sum())
+        if len(apart) and apart.min() > tolerance:
+            spans = "; ".join(f"{camera} {t[0]:.3f} to {t[-1]:.3f} s" for camera, t in times.items())
+            raise ValueError(f"{path}: {recording} has no frame with all cameras within {tolerance:g} s: {spans}")
         for i in np.flatnonzero(apart <= tolerance):
             away = max(away, float(apart[i]))
             rows.append(recording_row(recording, int(shown[i]), float(own[shown[i]])))
