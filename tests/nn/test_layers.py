@@ -33,7 +33,15 @@ def test_seeded_draws_what_the_seed_gives_while_another_thread_draws() -> None:
         begun.append(Thread(target=torch.randn, args=(5,)))
         begun[-1].start(), begun[-1].join()
         nn.init.trunc_normal_(kept)
-        return [first.weight, kept, torch.randn(4), torch.randperm(9), F.dropout(kept), torch.bernoulli(kept.abs() / 2)]
+        other = F.scaled_dot_product_attention(kept.view(1, 3, 3), kept.view(1, 3, 3), kept.view(1, 3, 3))
+        free = (
+            torch.randn(4),
+            torch.randint(9, (5,)),
+            torch.randint(2, 9, (5,)),
+            torch.randperm(9),
+            torch.rand_like(kept),
+        )
+        return [first.weight, *free, F.dropout(kept), torch.bernoulli(kept.abs() / 2), other]
 
     begun: list[Thread] = []
     with Seeded(3):

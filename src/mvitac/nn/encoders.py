@@ -310,11 +310,13 @@ class Seeded(TorchDispatchMode):
         self.drawn = {"generator": torch.Generator().manual_seed(seed)}
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if torch.Tag.nondeterministic_seeded not in func.tags:
-            return func(*args, **kwargs or {})
-        if all(argument.name != "generator" for argument in func._schema.arguments):
-            func = func.overloadpacket.generator
-        return func(*args, **self.drawn | (kwargs or {}))
+        device = (kwargs := kwargs or {}).get("device") or getattr(args[0] if args else None, "device", None)
+        if torch.Tag.nondeterministic_seeded in func.tags and (device is None or device.type != "cuda"):
+            name = "generator" if func._overloadname == "default" else f"{func._overloadname}_generator"
+            func = getattr(func.overloadpacket, name, func)  # rand, randn, randint and randperm have a form of its own
+            if any(argument.name == "generator" for argument in func._schema.arguments):
+                kwargs = self.drawn | kwargs
+        return func(*args, **kwargs)
 
 
 def build_towers(config: Encoders, spec: DataSpec, head: Callable[[int], nn.Module]) -> nn.ModuleDict:
