@@ -141,10 +141,8 @@ def _shared_by_parts(parts: Mapping[str, Pack]) -> str:
 
 
 def _mixed_tasks(parts: Mapping[str, Pack]) -> dict[str, Tasks]:
-    """The tasks of each part. Those of one name that mean the same are one; others become <part>/<name>.
-
-    So do values of a column that another part measures for a task of another name: a mix has one column of each name.
-    """
+    """The tasks of each part. Those of one name that mean the same are one; others become <part>/<name>. So do values
+    of a column that another part measures for a task of another name: a mix has one column of each name."""
     tasks = [task for pack in parts.values() for task in pack.spec.all_tasks]
     first = {task.name: task for task in reversed(tasks)}
     shared = {name for name in first if len({_meaning(task) for task in tasks if task.name == name}) == 1}

@@ -151,8 +151,6 @@ def _filter(size: int, stored: int) -> Tensor:
 
 
 def _along_width(x: Tensor, filter: Tensor) -> Tensor:
-    """[B, C, H, S] -> [B, C, H, size] in whole grey levels, rounded after each pass as torch's uint8 kernel does.
-
-    As a plain matrix product: OpenVINO 2026.4 cannot compile a batched one followed by a scale per channel.
-    """
+    """[B, C, H, S] -> [B, C, H, size] in whole grey levels, rounded after each pass as torch's uint8 kernel does. As a
+    plain matrix product: OpenVINO 2026.4 cannot compile a batched one followed by a scale per channel."""
     return (x.flatten(0, 2) @ filter.T + 0.5).floor().unflatten(0, x.shape[:3])

@@ -167,10 +167,8 @@ def _skewness_term(variance: _Variance, shares: np.ndarray, sizes: np.ndarray) -
 
 
 def _heavy_tailed(variance: _Variance, shares: np.ndarray, sizes: np.ndarray) -> _Variance:
-    """``variance`` over groups with fewer degrees of freedom, as squared errors have heavier tails than counts.
-
-    The variance of a sample variance grows with the excess kurtosis k by 1 + k (G - 1) / 2G; k is estimated, and at least 1.
-    """
+    """``variance`` over groups with fewer degrees of freedom, as squared errors have heavier tails than counts: a sample
+    variance varies with the excess kurtosis k as 1 + k (G - 1) / 2G. k is estimated, and at least 1."""
     deviations = shares - sizes * shares.sum() / sizes.sum()
     square = float((deviations**2).mean())
     excess = float((deviations**4).mean()) / square**2 - 3 if square else 0.0

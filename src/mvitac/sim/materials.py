@@ -249,9 +249,7 @@ def _feel(
     again: np.random.Generator | None,
 ) -> dict[str, Any]:
     """Press the object into a gel: "touch" and, if requested, "background" (uint8 [size, size, 3]), sensor and force.
-
-    The further sensor number `through` has a copy, LED gain and noise of its own, drawn from `again`.
-    """
+    The further sensor number `through` has a copy, LED gain and noise of its own, drawn from `again`."""
     sensor = choice[(int(rng.random() * len(choice)) + through) % len(choice)]
     force = float(np.exp(rng.uniform(*np.log((2.0, 12.0)))))
     gain, dome = float(np.exp(rng.uniform(*np.log((0.5, 1.2))))), float(rng.uniform(18.0, 40.0))

@@ -158,10 +158,8 @@ def _crop(image: UInt8[Tensor, "C H W"], box: list[int], flip: bool, size: int) 
 
 
 def _batched(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype, mean_std: MeanStd = IMAGENET) -> Tensor:
-    """The implementation for GPUs: crop, resize and flip the whole batch by two matrix products, Y @ image @ X'.
-
-    The antialiased filter is the same as on the CPU. On a GPU it uses fp16, whose weights err by less than 0.1 level.
-    """
+    """The implementation for GPUs: crop, resize and flip the whole batch by two matrix products, Y @ image @ X'. The
+    antialiased filter is the same as on the CPU. On a GPU it uses fp16, whose weights err by less than 0.1 level."""
     device = images.device
     top, left, height, width = drawn.boxes.to(device, torch.float32, non_blocking=True).unbind(1)
     exact = torch.float16 if device.type == "cuda" else torch.float32
