@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -411,14 +412,14 @@ def test_a_full_disk_ends_the_recording_only(tmp_path: Path, monkeypatch: pytest
 
 
 def test_a_recording_survives_a_crash(tmp_path: Path) -> None:
-    out = tmp_path / "recording"
+    out = tmp_path / "it's \"q\" \u00f6"
     recorder, image = Recorder(out, fps=1.0), np.zeros((16, 16, 3), np.uint8)
     for i in range(130):
         recorder({"touch": image + i}, {"time": float(i), "contact": i % 2 == 0, "touch_number": i // 2})
     del recorder  # killed: two of three parts are on disk
     with pytest.raises(ValueError, match="crashed and is finished by python -c") as refused:
         Recorder(out)
-    exec(re.search('"(.*)"', str(refused.value))[1])  # type: ignore[index]
+    exec(shlex.split(str(refused.value).partition("finished by ")[2])[2])
     pack = Pack(out)
     assert pack.num == 128 and np.array_equal(pack.images["touch"][:, 0, 0, 0], pack.column("time").astype(float))
 

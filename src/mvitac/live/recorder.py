@@ -5,6 +5,7 @@ After a crash the spool stays, and ``finish`` makes the pack.
 
 import io
 import json
+import shlex
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -86,7 +87,8 @@ class Recorder:
 
 
 def _command(out: Path) -> str:
-    return f'python -c "from mvitac.live.recorder import finish; print(finish({str(out)!r}), {"pairs"!r})"'
+    name = json.dumps(str(out), ensure_ascii=False)
+    return "python -c " + shlex.quote(f'from mvitac.live.recorder import finish; print(finish({name}), "pairs")')
 
 
 def _spool(out: Path) -> Path:
