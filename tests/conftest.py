@@ -55,9 +55,9 @@ def pack(tmp_path_factory: pytest.TempPathFactory) -> Pack:
 def turned(tmp_path_factory: pytest.TempPathFactory) -> Pack:
     """The same pairs, of which those of test are to learn from, and those of train to test."""
     from mvitac.data.build import build
-    from support.toy import Turned
+    from support.toy import Toy, swapped
 
-    return build(Turned(), tmp_path_factory.mktemp("turned") / "pack", size=32, quiet=True)
+    return build(swapped(Toy()), tmp_path_factory.mktemp("turned") / "pack", size=32, quiet=True)
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from mvitac.data.windows import windowed
 from mvitac.datasets.mix import MixConfig
 from mvitac.evaluation.leaks import Scored, source_of
 from support.mixes import Gel, Slice, built
-from support.toy import Toy, Turned, altered
+from support.toy import Toy, altered, swapped
 
 
 @pytest.fixture(scope="module")
@@ -149,12 +149,8 @@ def test_windows_of_a_mix_stay_within_a_touch_of_a_part(measured: Pack, tmp_path
         np.testing.assert_array_equal(mix.images["touch"][rows], windowed(part, window).images["touch"][:])
 
 
-class TurnedSlice(Turned, Slice):
-    """Train is test here."""
-
-
 def test_a_group_on_two_sides_is_refused_or_marked(pack: Pack, tmp_path: Path) -> None:
-    turned = built(TurnedSlice(num=60), tmp_path / "p")
+    turned = built(swapped(Slice(num=60)), tmp_path / "p")
     says = r"instance '0-6' is in train or val of part b and in test of part a, one of \d+"
     with pytest.raises(ValueError, match=says):
         MixedPack({"b": turned, "a": pack})
@@ -172,11 +168,12 @@ def test_a_leak_between_a_mix_and_a_pack_is_found(pack: Pack, gel: Pack) -> None
 
 
 def test_an_image_on_two_sides_under_two_names_is_refused(pack: Pack, tmp_path: Path) -> None:
-    turned = built(TurnedSlice(num=60, prefix="copy "), tmp_path / "p")
+    copies = swapped(Slice(num=60, prefix="copy "))
+    turned = built(copies, tmp_path / "p")
     says = r"the vision image of row 'copy 0\d+' is in train or val of part a and in test of part b, one of \d+: pack"
     with pytest.raises(ValueError, match=says):
         MixedPack({"a": pack, "b": turned})
-    small = built(TurnedSlice(num=60, prefix="copy "), tmp_path / "small", size=16)
+    small = built(copies, tmp_path / "small", size=16)
     MixedPack({"a": pack, "b": small})  # images of other sizes cannot be compared
 
 

@@ -1,7 +1,6 @@
 """An export for a touch sensor that the model never met: in live, its answers are those of the probe in known colours."""
 
 from collections import deque
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +13,6 @@ from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack
-from mvitac.data.source import Sample
 from mvitac.datasets.simulated import Materials, MaterialsConfig
 from mvitac.deploy.engine import Engine, about_sensor
 from mvitac.deploy.publish import with_probes
@@ -29,19 +27,11 @@ from mvitac.sim import materials
 from mvitac.sim.sensors import SENSORS
 from mvitac.training.loop import train
 from support.faults import Clock
+from support.toy import altered
 from support.training_runs import smoke
 
 pytestmark = pytest.mark.slow
 OPTION = "--new-sensor"
-
-
-class Unlabelled(Materials):
-    """Simulated touches, of which only those of test keep their split."""
-
-    def read(self, item: int) -> list[Sample]:
-        (sample,) = super().read(item)
-        kept = sample.columns["split"] == "test"
-        return [sample if kept else replace(sample, columns={**sample.columns, "split": "unlabelled"})]
 
 
 @pytest.fixture(scope="module")
@@ -52,8 +42,10 @@ def old(tmp_path_factory: pytest.TempPathFactory) -> Pack:
 
 @pytest.fixture(scope="module")
 def new(tmp_path_factory: pytest.TempPathFactory) -> Pack:
-    config = MaterialsConfig(num=100, touches=1, size=32, held_out_sensor=True)
-    return build(Unlabelled(config), tmp_path_factory.mktemp("new") / "pack", size=32, quiet=True)
+    """Simulated touches, of which only those of test keep their split."""
+    config, splits = MaterialsConfig(num=100, touches=1, size=32, held_out_sensor=True), {"test": "test"}
+    source = altered(Materials(config), lambda s, _: {"split": splits.get(s.columns["split"], "unlabelled")})
+    return build(source, tmp_path_factory.mktemp("new") / "pack", size=32, quiet=True)
 
 
 @pytest.fixture(scope="module")

@@ -90,15 +90,6 @@ class Toy(Source):
         return [Sample(vision=image(self.vision_channels), touch=image(self.touch_channels), columns=columns)]
 
 
-class Turned(Toy):
-    """The same samples with train and test the other way round."""
-
-    def read(self, item: int) -> list[Sample]:
-        (sample,) = super().read(item)
-        split = {"train": "test", "test": "train"}.get(sample.columns["split"], sample.columns["split"])
-        return [replace(sample, columns={**sample.columns, "split": split})]
-
-
 @dataclass
 class Counting(Toy):
     """The toy, which keeps what was read of it."""
@@ -122,6 +113,12 @@ def altered(source: Source, change: Callable[[Sample, int], dict[str, Any]] = la
 
     made.spec, made.read = lambda: spec, lambda item: [changed(sample, item) for sample in read(item)]  # type: ignore
     return made
+
+
+def swapped(source: Source) -> Any:
+    """The same samples with train and test the other way round."""
+    other = {"train": "test", "test": "train", "val": "val"}
+    return altered(source, lambda sample, _: {"split": other[sample.columns["split"]]})
 
 
 def with_columns(pack: Pack, *, spec: DataSpec | None = None, **columns: Any) -> Pack:
