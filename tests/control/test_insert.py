@@ -46,13 +46,12 @@ def test_criteria_are_those_of_the_suite() -> None:
         world.step(world.known + np.array([0.5, 0.0]))
     success, mm, deg = world.result()
     assert success and 0.05 < mm < 0.7
-    others: list[tuple[dict[str, Any], bool]] = [
+    for criteria, holds in (
         ({"success_mm": mm / 2}, False),
         ({"success_depth": 1.2}, False),
         ({"success_deg": deg / 2}, False),
         ({"success_deg": deg + 1e-6}, True),
-    ]
-    for criteria, holds in others:
+    ):
         world.suite = replace(WHOLE, **criteria)
         assert world.result()[0] == holds
 

@@ -89,9 +89,8 @@ def test_what_cannot_be_compared_is_refused(pack: Pack, negative: Pack, tmp_path
             JoinedPack(pack, build(source, tmp_path / str(number), size=32, quiet=True))
     with pytest.raises(ValueError, match=r"vision: 3 channels at 32 px in .*, 3 channels at 24 px in"):
         JoinedPack(pack, toy_pack(tmp_path / "small", size=24))
-    alone = [toy_pack(tmp_path / f"touch{size}", size=size, vision_channels=0) for size in (24, 32)]
     with pytest.raises(ValueError, match=r"touch: 3 channels at 24 px"):  # not the vision that both lack
-        JoinedPack(*alone)
+        JoinedPack(*(toy_pack(tmp_path / f"touch{size}", size=size, vision_channels=0) for size in (24, 32)))
 
 
 def test_an_image_that_is_learned_from_and_scored_is_refused(pack: Pack, tmp_path: Path) -> None:

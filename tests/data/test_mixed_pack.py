@@ -93,8 +93,7 @@ def test_a_column_is_of_the_task_and_the_control_that_name_it(tmp_path: Path) ->
     for k, (name, control) in enumerate((("depth", "near"), ("height", "far"))):
         task = ValueTask(name=name, targets=(Target(name="z", unit="mm"),))
         spec: dict[str, Any] = {"values": (task,), "controls": {control: ("z",)}}
-        toy = altered(Slice(num=30, first=60 * k), lambda _, i: {"z": i / 2}, **spec)
-        parts[name] = built(toy, tmp_path / name)
+        parts[name] = built(altered(Slice(num=30, first=60 * k), lambda _, i: {"z": i / 2}, **spec), tmp_path / name)
     mix = MixedPack(parts)
     assert [task.name for task in mix.spec.values] == ["depth/depth", "height/height"]
     for task, columns in zip(mix.spec.values, mix.spec.controls.values(), strict=True):

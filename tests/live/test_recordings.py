@@ -38,11 +38,8 @@ def films(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pat
             image[30:90, 40:120] += 80
         return image.astype(np.uint8)
 
-    def vision(number: int) -> np.ndarray:
-        return np.full((120, 160, 3), 10 * number, np.uint8)
-
     write_video(folder / "touch.mp4", NUM, touch)
-    write_video(folder / "vision.mp4", 24, vision, rate=12)
+    write_video(folder / "vision.mp4", 24, lambda number: np.full((120, 160, 3), 10 * number, np.uint8), rate=12)
     return {m: folder / f"{m}.mp4" for m in ("vision", "touch")}
 
 
@@ -216,7 +213,7 @@ def test_predict_command(
     Image.fromarray(pack.images["touch"][8]).save(tmp_path / "other.png")
     (two := tmp_path / "two.csv").write_text("vision,left,right\nvision.png,touch.png,other.png\n")
     (empty := tmp_path / "empty").mkdir()
-    wrong = {
+    for words, says in {
         (): "give one SOURCE",
         (str(films["touch"]), *both): "give one SOURCE",
         (str(films["touch"]),): "takes vision and touch",
@@ -226,8 +223,7 @@ def test_predict_command(
         (str(tmp_path / "some16"),): "some16 has images of vision of (16, 16, 3), the model takes (32, 32, 3)",
         (str(two),): f"error: {two} has images of touch of (32, 32, 6), the model takes (",
         (str(tmp_path / "gel.csv"),): "has no vision, which the model takes too",
-    }
-    for words, says in wrong.items():
+    }.items():
         assert main([*command, *words, "--out", str(out)]) == 2 and says in capsys.readouterr().err
 
 

@@ -144,8 +144,7 @@ def test_rows_without_a_loss_are_not_drawn_and_those_with_one_are(parts: dict[st
     run = mix_run(parts["a"], parts["gel"])
     pack = run.data.open()
     assert isinstance(pack, MixedPack)
-    cases: Any = ((("vv",), 1), (("tt",), 2), (("vt", "tv"), 1), (("vv", "tt"), 2))
-    for losses, num in cases:
+    for losses, num in ((("vv",), 1), (("tt",), 2), (("vt", "tv"), 1), (("vv", "tt"), 2)):
         assert set(pack.part_of[MViTacConfig(losses=losses).training_rows(pack)]) == set(range(num))
     by_touch = SupervisedConfig(modalities=("touch",), tasks=("pattern",))
     assert np.array_equal(by_touch.training_rows(pack), pack.rows("train", "val"))
@@ -156,12 +155,11 @@ def test_rows_without_a_loss_are_not_drawn_and_those_with_one_are(parts: dict[st
 def test_what_a_mix_cannot_do_is_refused(parts: dict[str, str], tmp_path: Path) -> None:
     ragged = (parts["a"], parts["gel"])
     many = "part b has 24 rows to train on, for 32 of a batch of 36: a row would be its own negative"
-    cases: list[tuple[Any, str]] = [
+    for run, message in (
         (mix_run(*ragged, batch_size=8, chunk=4), "lack a modality support neither several processes nor --chunk"),
         (mix_run(*ragged, batch_size=2), "batch_size 2: parts that lack a modality need at least 3"),
         (mix_run(f"{parts['a']}:1", f"{parts['b']}:8", batch_size=36), many),
-    ]
-    for run, message in cases:
+    ):
         with pytest.raises(ValueError, match=message):
             train(run, tmp_path / "run", quiet=True)
 

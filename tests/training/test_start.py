@@ -198,13 +198,12 @@ def test_mistakes_are_one_line(pack: Pack, smoke_run: Path, tmp_path: Path, caps
         train(smoke(pack, checkpoint_every=1, eval_every=0), tmp_path / "unfinished", quiet=True)
     capsys.readouterr()
     data = ["pretrain", "--recipe", "smoke", "--data", "pack", "--data.path", str(pack.path), "--steps", "1", "--quiet"]
-    cases = [
+    for words, expected in (
         (["--init", str(tmp_path / "unfinished")], "its run is not finished, continue it with --resume"),
         (["--encoder.weights", str(tmp_path / "nan.safetensors")], "nan.safetensors holds NaN or infinite numbers: "),
         (["--init", str(tmp_path / "nan.safetensors")], "nan.safetensors was not written by mvitac"),
         ([f"--init={smoke_run}", "--encoder.trunk", "resnet10t"], "does not fit this run (vision: its trunk is"),
-    ]
-    for words, expected in cases:
+    ):
         assert main([*data, *words, "--out", str(tmp_path / "out")]) == 2, words
         error = capsys.readouterr().err
         assert expected in error and error.count("\n") == 1, error
