@@ -90,9 +90,8 @@ def test_a_trim_counts_what_is_shown(made: dict[str, Path], tmp_path: Path, kind
 
 
 def test_pieces_put_together_without_encoding_anew_are_refused(made: dict[str, Path], tmp_path: Path) -> None:
-    path = edited(made["mpeg4"], tmp_path / "v.mp4", (31, 20), (5, 10))
     with pytest.raises(ValueError, match=r"v\.mp4 is put together from pieces by an edit list: encode it again"):
-        num_frames(path)
+        num_frames(edited(made["mpeg4"], tmp_path / "v.mp4", (31, 20), (5, 10)))
 
 
 def test_shrinking_is_that_of_pillow(made: dict[str, Path]) -> None:

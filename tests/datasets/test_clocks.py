@@ -142,9 +142,8 @@ def test_two_cameras_out_of_step_are_paired_by_time(tmp_path: Path) -> None:
     assert "gel and camera are paired by time, at most 0.04 s apart; 9 frames without a partner" in pack.spec.notes[0]
     assert pack.num == 3 * 22
     write_csv(tmp_path / "set/1/gel_timestamps.csv", time=100 + np.arange(50) / 25)  # the other camera's begin at 0
-    with pytest.raises(
-        ValueError, match=r"set: 1 has no frame .* camera 0\.000 to 1\.700 s; gel 100\.000 to 101\.960 s"
-    ):
+    says = r"set: 1 has no frame .* camera 0\.000 to 1\.700 s; gel 100\.000 to 101\.960 s"
+    with pytest.raises(ValueError, match=says):
         packed(tmp_path / "set", tmp_path / "q", tolerance=0.05, **names)
 
 

@@ -44,22 +44,19 @@ def make_rows(root: Path) -> Table:
     """24 rows of plain pictures: 8 objects x 3 touches, 2 materials, one object unlabelled, three image columns."""
     rows: Table = []
     for i in range(NUM):
-        for which, name in enumerate(("vision", "left", "right")):
-            picture(root / name / f"{i:02d}.png", colour(i, which), (20, 16))
+        images = {name: f"{name}/{i:02d}.png" for name in ("vision", "left", "right")}
+        for which, path in enumerate(images.values()):
+            picture(root / path, colour(i, which), (20, 16))
         place = i // 3
-        rows.append(
-            {
-                "vision": f"vision/{i:02d}.png",
-                "left": f"left/{i:02d}.png",
-                "right": f"right/{i:02d}.png",
-                "material": ("wood", "metal")[place % 2] if place < 7 else "",
-                "stiffness": (place * 2) % 12,
-                "object": f"{place:03d}",
-                "seq": i % 3,
-                "width": 1.5 * i,
-                "side": "train" if place < 4 or place == 7 else "val" if place == 4 else "test",
-            }
-        )
+        about = {
+            "material": ("wood", "metal")[place % 2] if place < 7 else "",
+            "stiffness": (place * 2) % 12,
+            "object": f"{place:03d}",
+            "seq": i % 3,
+            "width": 1.5 * i,
+            "side": "train" if place < 4 or place == 7 else "val" if place == 4 else "test",
+        }
+        rows.append(images | about)
     return rows
 
 

@@ -200,16 +200,15 @@ def pressed(root: Path) -> Table:
     for i in range(24):
         base, empty = (60, 180)[i // 12], i % 12 < 2
         value = base + (2 * (i % 12) - 1 if empty else 5 * (i % 12) - 40)
-        rows.append(
-            {
-                "touch": picture(root / f"{i}.png", value).name,
-                "background": picture(root / f"own{i}.png", 50 + i).name,
-                "sensor": ("digit", "mini")[i // 12],
-                "phase": "empty" if empty else "press",
-                "label": "ab"[i % 2],
-                "value": value,
-            }
-        )
+        row = {
+            "touch": picture(root / f"{i}.png", value).name,
+            "background": picture(root / f"own{i}.png", 50 + i).name,
+            "sensor": ("digit", "mini")[i // 12],
+            "phase": "empty" if empty else "press",
+            "label": "ab"[i % 2],
+            "value": value,
+        }
+        rows.append(row)
     return rows
 
 

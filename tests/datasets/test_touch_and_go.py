@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -289,8 +290,6 @@ def test_missing_recordings_are_named_and_may_be_left_out(tree: Path, tmp_path: 
 def test_a_damaged_stretch_is_left_out_and_listed(tree: Path, tmp_path: Path) -> None:
     root = shutil.copytree(tree, tmp_path / "tree")
     path = root / "dataset" / NAMES[2] / "gelsight.mp4"
-    import av
-
     with av.open(str(path)) as container:
         at, size = next((p.pos, p.size) for i, p in enumerate(container.demux(video=0)) if i == 134)
     whole = bytearray(path.read_bytes())
