@@ -23,8 +23,8 @@ DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted(p for p in (DOCS / "tutorials").glob("*.md") if p.name != "index.md")
 
 
-def cells(file: Path) -> list[tuple[str, str]]:
-    return [(cell.cell_type, cell.source) for cell in jupytext.read(file).cells]
+def code_of(file: Path) -> list[str]:
+    return [cell.source for cell in jupytext.read(file).cells if cell.cell_type == "code"]
 
 
 def run(page: Path, folder: Path, names: dict[str, Any] | None = None) -> None:
@@ -37,9 +37,7 @@ def run(page: Path, folder: Path, names: dict[str, Any] | None = None) -> None:
 def run_cells(page: Path, names: dict[str, Any]) -> None:
     from mvitac.cli.main import main
 
-    for kind, source in cells(page):
-        if kind != "code":
-            continue
+    for source in code_of(page):
         if not source.startswith("%%bash\n"):
             exec(compile(source, page.name, "exec"), names)
             continue
@@ -73,8 +71,7 @@ def test_later_pages_run(artifact: Path, pack: Pack, tmp_path: Path, monkeypatch
                 Image.fromarray(pack.images[modality][row]).save(f"my_sensor/{name}")
             table.writerow([*names.values(), pack.labels("bright")[row], pack.column("group")[row]])
     names: dict[str, Any] = {"__name__": "encoders"}
-    pages = DOCS / "encoders.md", DOCS / "policies.md"
-    code = [source for page in pages for kind, source in cells(page) if kind == "code"]
+    code = code_of(DOCS / "encoders.md") + code_of(DOCS / "policies.md")
     assert len(code) == 5  # one of each section
     for source in code:
         exec(compile(source, "page", "exec"), names)

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,17 +38,14 @@ from support.training_runs import smoke
 EXACT = {"min_cosine": 0.9999, "accuracy_loss": 0.0}
 
 
-def run_graph(graph: ExportModule):
-    def call(arrays: list[np.ndarray]) -> list[np.ndarray]:
-        with torch.no_grad():
-            return [x.numpy() for x in graph(*(torch.from_numpy(a) for a in arrays))]
-
-    return call
+@torch.no_grad()
+def run_graph(graph: ExportModule, arrays: list[np.ndarray]) -> list[np.ndarray]:
+    return [x.numpy() for x in graph(*(torch.from_numpy(a) for a in arrays))]
 
 
 def check(model: Model, graph: ExportModule, pack: Pack) -> dict:
     rows = pack.rows("test")
-    return parity(graph, run_graph(graph), pack, rows, reference(model, graph, pack, rows), **EXACT)
+    return parity(graph, partial(run_graph, graph), pack, rows, reference(model, graph, pack, rows), **EXACT)
 
 
 @contextmanager
@@ -232,11 +230,11 @@ def test_accuracy_is_of_classes_by_name(model: Model, pack: Pack) -> None:
 
 def test_lost_accuracy_stops_an_export(model: Model, pack: Pack) -> None:
     graph, rows = ExportModule(model), pack.rows("test")
-    wanted, call = reference(model, graph, pack, rows), run_graph(graph)
+    wanted = reference(model, graph, pack, rows)
     at = graph.outputs.index("probability_pattern")
 
     def worse(arrays: list[np.ndarray]) -> list[np.ndarray]:
-        found = call(arrays)
+        found = run_graph(graph, arrays)
         found[at] = np.roll(found[at], 1, axis=1)
         return found
 
@@ -349,7 +347,7 @@ def test_an_export_that_changes_a_value_is_refused(value_artifact: Path, measure
     std = float(np.nanstd(measured.values(measured.spec.values[1])[rows, 1]))  # weight
 
     def call(arrays: list[np.ndarray]) -> list[np.ndarray]:
-        found = run_graph(graph)(arrays)
+        found = run_graph(graph, arrays)
         found[-1] = found[-1] + np.array([0, 0.2 * std], np.float32)  # of task both: the weight alone
         return found
 
@@ -361,6 +359,6 @@ def test_an_export_that_changes_a_value_is_refused(value_artifact: Path, measure
     assert report["values"]["both"][1]["num"] == 16 and report["values"]["light"][0]["change"] < 1e-3
     # Of a pack that lacks them they are still compared.
     rows, wanted = pack.rows("test"), reference(model, graph, pack, pack.rows("test"))
-    light = parity(graph, run_graph(graph), pack, rows, wanted, min_cosine=0.99)["values"]["light"][0]
+    light = parity(graph, partial(run_graph, graph), pack, rows, wanted, min_cosine=0.99)["values"]["light"][0]
     assert light["num"] == 0 and light["original"] is None
     assert light["allowed"] == pytest.approx(0.1 * wanted["value_light"].std(), rel=1e-4)

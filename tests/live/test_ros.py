@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,14 +20,11 @@ from support.ros import START, STORE, compressed, raw
 
 VISION, TOUCH = "/camera/image/compressed", "/gel/image_raw"
 LATE = 0.02  # seconds from an image's stamp to its arrival
+load_node = partial(load_example, "node", "ros/mvitac_ros/mvitac_ros")
 SENSOR_MSGS, STD_MSGS = (
     SimpleNamespace(**{name.rpartition("/")[2]: kind for name, kind in STORE.types.items() if name.startswith(package)})
     for package in ("sensor_msgs/msg", "std_msgs/msg")
 )
-
-
-def load_node() -> Any:
-    return load_example("node", "ros/mvitac_ros/mvitac_ros")
 
 
 def carried(message: Any) -> Any:

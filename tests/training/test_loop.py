@@ -36,17 +36,17 @@ from support.toy import toy_pack, with_columns
 from support.training_runs import assert_equal_weights, batches, log_of, power_cut, smoke, stopped_at, views_by
 
 
-def test_leaves_the_promised_files(smoke_run: Path) -> None:
-    assert {p.name for p in smoke_run.iterdir() if not p.name.startswith("probe")} == {
-        *("run.json", "trained_on.safetensors", "log.jsonl", "checkpoint.pt", "model.safetensors"),
-        "model.best.safetensors",
-    }
+def test_leaves_the_promised_files_and_is_not_trained_over(pack: Pack, smoke_run: Path) -> None:
+    tensors = {f"{name}.safetensors" for name in ("model", "model.best", "trained_on")}
+    found = {p.name for p in smoke_run.iterdir() if not p.name.startswith("probe")}
+    assert found == tensors | {"run.json", "log.jsonl", "checkpoint.pt"}
     lines = log_of(smoke_run)
     assert [line["step"] for line in lines if "loss" in line] == [2, 4, 6, 8]
     assert [line["step"] for line in lines if "eval" in line] == [0, 4, 8]
-    for line in lines:
-        if "loss" in line:
-            assert line["loss"] == pytest.approx(sum(line[k] for k in ("vv", "tt", "vt", "tv")), rel=1e-5)
+    for line in (line for line in lines if "loss" in line):
+        assert line["loss"] == pytest.approx(sum(line[k] for k in ("vv", "tt", "vt", "tv")), rel=1e-5)
+    with pytest.raises(ValueError, match="already holds a run"):
+        train(smoke(pack), smoke_run, quiet=True)
 
 
 @pytest.mark.parametrize("stop_after", [3, 7])
@@ -186,11 +186,6 @@ def test_not_a_number_stops_and_keeps_the_last_good_checkpoint(
         monkeypatch.setattr(MViTac, "contrast", lambda self, z, losses=losses: losses)
         with pytest.raises(ValueError, match="MViTac returned no dict with a scalar tensor 'loss'"):
             train(run, tmp_path / "no", quiet=True, resume=True)
-
-
-def test_a_run_is_not_trained_over(pack: Pack, smoke_run: Path) -> None:
-    with pytest.raises(ValueError, match="already holds a run"):
-        train(smoke(pack), smoke_run, quiet=True)
 
 
 def test_learns_the_stripes(tmp_path: Path) -> None:

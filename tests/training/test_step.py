@@ -64,8 +64,7 @@ def test_bf16_keeps_the_direction_of_the_gradient() -> None:
 CHUNKED = [
     *[(small("mvitac"), size) for size in (2, 4, 6)],
     (replace(small("mvitac"), losses=("vv", "vt")), 4),
-    *[(small(name), 4) for name in ("cmc", "ssvtp", "simclr", "moco", "mct", "byol", "dino", "vicreg")],
-    *[(small(name), 4) for name in ("mae", "ijepa")],
+    *[(small(name), 4) for name in ("cmc", "ssvtp", "simclr", "moco", "mct", "byol", "dino", "vicreg", "mae", "ijepa")],
 ]
 
 
