@@ -61,6 +61,16 @@ def turned(tmp_path_factory: pytest.TempPathFactory) -> Pack:
 
 
 @pytest.fixture
+def two_threads() -> Iterator[None]:
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports with empty figures, for tests of their text: one has up to thirty, each of which takes 0.2 s to draw."""
     from mvitac.report import figures

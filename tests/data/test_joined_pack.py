@@ -71,7 +71,7 @@ def test_columns_matter_that_probes_read(tmp_path: Path, column: str) -> None:
             JoinedPack(packs[0], toy_pack(tmp_path / "c"))
 
 
-def test_what_cannot_be_compared_is_refused(pack: Pack, negative: Pack, tmp_path: Path) -> None:
+def test_what_cannot_be_compared_is_refused(pack: Pack, tmp_path: Path) -> None:
     def elsewhere(sample: Sample, _: int) -> dict[str, str]:
         return {"split": ELSEWHERE[sample.columns["split"]]}
 

@@ -75,7 +75,7 @@ def test_one_task_if_classes_agree_else_two(pack: Pack, gel: Pack) -> None:
     np.testing.assert_array_equal(np.isfinite(mix.column(column)), mix.column("part") == "toy")
 
 
-def test_a_control_of_one_part_is_no_value_of_another(gel: Pack, tmp_path: Path) -> None:
+def test_a_control_of_one_part_is_no_value_of_another(tmp_path: Path) -> None:
     """Here force is in mN, and nothing that the part measures."""
     aside = altered(Slice(num=30, first=60), lambda _, item: {"force": 1000.0 * item}, controls={"force": ("force",)})
     mix = MixedPack({"a": built(pressed(), tmp_path / "a"), "b": built(aside, tmp_path / "b")})

@@ -105,7 +105,7 @@ def test_shrinking_is_that_of_pillow(made: dict[str, Path]) -> None:
     assert np.abs(shrunk - nearest).mean() > 5  # dropping pixels would show
 
 
-def test_frames_are_upright(made: dict[str, Path], tmp_path: Path) -> None:
+def test_frames_are_upright(tmp_path: Path) -> None:
     """The header says that players turn a quarter clockwise, as a telephone's do."""
     path, one = write_video(tmp_path / "a.mp4", 1, lambda i: numbered(i, "touch")), (1 << 16).to_bytes(4, "big")
     ((_, plain),) = frames(path, [0])

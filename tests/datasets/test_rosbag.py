@@ -164,7 +164,7 @@ def test_a_bag_that_is_cut_or_no_file(tmp_path: Path) -> None:
         packed(RosbagConfig(path=tmp_path / "bag", touch=(GEL,)), tmp_path / "pack")
 
 
-def test_a_short_image_is_named(tmp_path: Path) -> None:
+def test_a_short_image_is_named() -> None:
     message = raw(0.0, np.zeros((16, 20, 3), np.uint8), "rgb8")
     for data, height in ((message.data[:-40], 16), (message.data, 0), (message.data[:-128], 16)):
         message.data, message.height = data, height

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import huggingface_hub
 import pytest
 import torch
 
@@ -109,8 +110,6 @@ def test_the_hub_offline_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.M
 def test_a_download_is_an_artifact_and_no_other_file_is_asked_for(
     artifact: Path, copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import huggingface_hub
-
     asked: dict[str, Any] = {}
     download = lambda repo, **options: asked.update(options, repo=repo) or str(copy)  # noqa: E731
     monkeypatch.setattr(huggingface_hub, "snapshot_download", download)

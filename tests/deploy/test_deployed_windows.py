@@ -64,7 +64,7 @@ def test_other_than_clips_are_refused(model: Model) -> None:
             model.embed(touch=given)
 
 
-def test_each_frame_is_minus_the_first_one_of_its_touch(published: Path, model: Model, measured: Pack) -> None:
+def test_each_frame_is_minus_the_first_one_of_its_touch(published: Path, measured: Pack) -> None:
     other = mvitac.load(published)
     other.spec = replace(other.spec, window=replace(other.spec.window, minus_first=True))
     touch = measured.images["touch"]

@@ -56,7 +56,7 @@ def test_a_row_finds_itself_and_both_directions_work(known: Path, pack: Pack, mo
     assert opened.labels(0)["pattern"] == pack.spec.tasks[0].classes[pack.column("label_pattern")[0]]
 
 
-def test_rows_of_another_size_than_a_query_has_are_refused(artifact: Path, tmp_path: Path, model: Model) -> None:
+def test_rows_of_another_size_than_a_query_has_are_refused(tmp_path: Path, model: Model) -> None:
     with pytest.raises(ValueError, match="has images of 24 px: pack it again with --size 32"):
         embed(model, toy_pack(tmp_path / "small", size=24), tmp_path / "e.parquet")
 

@@ -124,7 +124,7 @@ def test_every_score_has_its_controls(result: dict) -> None:
     assert max(map(len, text.splitlines())) <= 80
 
 
-def test_folds_test_every_group_once_that_no_run_learned_from(pack: Pack, runs: list[Path], tmp_path: Path) -> None:
+def test_folds_test_every_group_once_that_no_run_learned_from(pack: Pack, runs: list[Path]) -> None:
     """Each class in each fold; the seven tenths that were trained on are fitted on, or the folds are of all, elsewhere."""
     groups = pack.column("group").astype(str)
     learned = set(groups[pack.rows("train")])

@@ -29,7 +29,7 @@ NUM, FREE, FIRST = 50, 20, LiveConfig(calibration=8)
 
 
 @pytest.fixture(scope="module")
-def films(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def films(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder, noise = tmp_path_factory.mktemp("films"), np.random.default_rng(0).integers(0, 4, (NUM, 120, 160, 3))
 
     def touch(number: int) -> np.ndarray:

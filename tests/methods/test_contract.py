@@ -18,12 +18,11 @@ from mvitac.recipes import with_method
 from mvitac.registry import default, from_json, to_json
 from mvitac.run import Optim
 from mvitac.training.step import build_optimiser
-from support.small_methods import TINY_VIT, build, outcome, views
+from support.small_methods import PAIRED, TINY_VIT, build, outcome, views
 from support.toy import Toy
 from support.training_runs import smoke, train_twice
 
 NAMES = sorted(MethodConfig.choices)
-PAIRED = ("cmc", "mct", "ssvtp")
 
 
 @pytest.mark.parametrize("touch", [3, 6])

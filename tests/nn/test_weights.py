@@ -159,7 +159,7 @@ def test_weights_that_do_not_fit_are_refused(kind: str, state: State, tmp_path: 
     assert len(str(caught.value).splitlines()) == 1 and str(tmp_path / "w.pth") in str(caught.value)
 
 
-def test_positions_of_another_size_are_those_that_timm_makes(tmp_path: Path) -> None:
+def test_positions_of_another_size_are_those_that_timm_makes() -> None:
     torch.manual_seed(0)
     large = timm.create_model("test_vit", img_size=160)
     with pytest.raises(ValueError, match="left over"):  # two sets of weights, of which timm would take the second

@@ -14,6 +14,7 @@ from support.toy import Toy
 TINY = Encoders().changed(trunk="mvitac_tiny", weights=SCRATCH)
 TINY_VIT = Encoders().changed(trunk="mvitac_tiny_vit", weights=SCRATCH)
 ROWS = torch.arange(3, 83)
+PAIRED = ("cmc", "mct", "ssvtp")
 
 
 def small(name: str) -> MethodConfig:

@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import threading
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -79,14 +78,6 @@ def test_nothing_is_shown_unasked(capsys: pytest.CaptureFixture[str], monkeypatc
         tick("probes")
         say("drawn")
     assert capsys.readouterr() == ("", "")
-
-
-@pytest.fixture
-def two_threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
 
 
 def test_several_at_a_time_in_order_and_the_threads_come_back(two_threads: None) -> None:

@@ -20,11 +20,10 @@ from mvitac.recipes import with_method
 from mvitac.training.loader import ImageLoader
 from mvitac.training.loop import train
 from support.mixes import Gel, Slice, built, mix_run
-from support.small_methods import build, small
+from support.small_methods import PAIRED, build, small
 from support.training_runs import assert_equal_weights, batches, log_of, smoke, train_twice, views_by
 
 MISSING = sorted(name for name, config in MethodConfig.choices.items() if config.takes_missing)
-PAIRED = ("cmc", "mct", "ssvtp")
 
 
 @pytest.fixture(scope="module")

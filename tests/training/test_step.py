@@ -107,7 +107,7 @@ def test_impossible_steps_are_named(pack: Pack, tmp_path: Path) -> None:
         train(smoke(pack, chunk=4, method=SupervisedConfig()), tmp_path / "r", quiet=True)
 
 
-def test_towers_side_by_side_are_those_of_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_towers_side_by_side_are_those_of_one_thread(two_threads: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """MViTac's two towers train in two threads where there are two: the same weights, bit for bit."""
     run = replace(RUN, method=MViTacConfig(keys="end-to-end", losses=("vt", "tv")))
     at_once, calls = system_threads._at_once, []
@@ -124,11 +124,7 @@ def test_towers_side_by_side_are_those_of_one_thread(monkeypatch: pytest.MonkeyP
         assert unused and all(".intra." in name for name in unused)  # not zeros, which weight decay would act on
         return method.state_dict()
 
-    before = torch.get_num_threads()
-    try:
-        one, two = trained(1), trained(2)
-    finally:
-        torch.set_num_threads(before)
+    one, two = trained(1), trained(2)
     assert calls == [2, 2] * 3  # forward and backward of each step, of the second training alone
     torch.testing.assert_close(one, two, rtol=0, atol=0)
     assert draws_random_numbers(build()) and not draws_random_numbers(build(run))  # with dropout they are not

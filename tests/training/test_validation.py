@@ -64,7 +64,7 @@ def test_the_first_of_equally_good_weights_is_kept(pack: Pack, tmp_path: Path, m
     assert "rose: touch/a +10.0 [+10.0, +10.0]" in said
 
 
-def test_killed_and_resumed_keeps_the_same_best_weights_and_sentence(pack: Pack, run: Path, tmp_path: Path) -> None:
+def test_killed_and_resumed_keeps_the_same_best_weights_and_sentence(run: Path, tmp_path: Path) -> None:
     """Killed before the first checkpoint, and between two; the start is not evaluated again."""
     again, settings = tmp_path / "r", mvitac.load(run).run
     for cut in (1, 5):
@@ -141,7 +141,7 @@ def test_a_value_far_from_zero_has_the_same_r2(measured: Pack) -> None:
     assert scores[0] == pytest.approx(scores[1], abs=1e-4)
 
 
-def test_probe_scores_best_weights(pack: Pack, run: Path, smoke_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_probe_scores_best_weights(pack: Pack, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = ["--weights", "best", "--tasks", "pattern", "--modalities", "touch", "--no-controls"]
     assert main(["probe", str(run), *asked]) == 0
     assert "mvitac, best" in capsys.readouterr().out and not (run / "probe.json").exists()
