@@ -220,5 +220,6 @@ def test_embed_takes_images_in_batches(smoke_run: Path, pack: Pack, monkeypatch:
     monkeypatch.setattr(model, "features", lambda m, x, **how: sizes.append(len(x)) or features(m, x, **how))
     torch.testing.assert_close(model.embed(touch=images)["touch"], whole, atol=1e-4, rtol=1e-4)
     assert sizes == [4, 4, 2]
+    model.encoders["touch"].train()
     with pytest.raises(ValueError, match=r"call model.eval\(\) first"):
-        model.train().embed(touch=images)
+        model.embed(touch=images)

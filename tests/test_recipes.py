@@ -83,6 +83,8 @@ def test_a_grasps_phases_are_not_each_others_positives(pack: Pack) -> None:
     assert recipe("paper", Phased()).augment.vision.grayscale == 0
     assert recipe("paper", PackConfig(), phased=False).augment.vision.grayscale == 0.2
     assert recipe("smoke", pack) == recipe("smoke", PackConfig(path=pack.path))
+    hiding = PackConfig(path=pack.path, score_on="val")
+    assert recipe("smoke", hiding.open()) == recipe("smoke", hiding)
 
 
 @pytest.fixture(scope="module")

@@ -215,7 +215,7 @@ class Model(nn.Module):
             >>> model.embed(touch=np.zeros((4, 240, 320, 3), np.uint8))["touch"].shape  # doctest: +SKIP
             torch.Size([4, 512])
         """
-        if self.training:
+        if any(module.training for module in self.modules()):
             raise ValueError("the model is in training mode, which would change BatchNorm: call model.eval() first")
         given = self._named(vision=vision, touch=touch)
         self._check_background("touch" if touch is not None else "vision", background)

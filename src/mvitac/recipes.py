@@ -186,7 +186,8 @@ def recipe(name: str, data: DatasetConfig | Pack | None = None, phased: bool | N
     """
     check_known("recipe", [name], RECIPES)
     if isinstance(data, Pack):
-        data, phased = PackConfig(path=data.path), data.phased if phased is None else phased
-    data = data or default(DatasetConfig, "materials")
-    phased = data.phased if phased is None else phased
-    return RECIPES[name](data, data.open(quiet=True).phased if phased is None else phased)
+        phased = data.phased if phased is None else phased
+        data = data.config or PackConfig(path=data.path)
+    given: DatasetConfig = data or default(DatasetConfig, "materials")  # type: ignore[assignment]
+    phased = given.phased if phased is None else phased
+    return RECIPES[name](given, given.open(quiet=True).phased if phased is None else phased)

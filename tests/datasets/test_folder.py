@@ -26,7 +26,8 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import UNGROUPED
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.table.columns import Condition
-from mvitac.datasets.table.manifest import Manifest
+from mvitac.datasets.table.image_refs import ImageRef, span_of
+from mvitac.datasets.table.manifest import Manifest, read_manifest
 from mvitac.datasets.table.splits import assign_splits
 from mvitac.datasets.table.table import Rows
 from mvitac.system.files import cache_dir
@@ -105,6 +106,9 @@ def test_csv_parquet_and_jsonl_give_one_pack(tmp_path: Path) -> None:
         file = write(make_rows(folder), folder / f"manifest.{suffix}")
         digests.add(packed(config(file, **options), folder / "p").digest)
     assert len(digests) == 1
+    stamps = pa.array([10**18 + 999 * i for i in range(NUM)], pa.timestamp("ns"))
+    pq.write_table(pq.read_table(file := tmp_path / "parquet/manifest.parquet").append_column("at", stamps), file)
+    assert read_manifest(file).rows[2]["at"] == "2001-09-09 01:46:40.000001"
 
 
 def test_two_workers_give_the_pack_of_one(tmp_path: Path, rows: Table, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -264,6 +268,7 @@ def test_sixteen_bits_are_scaled_not_clipped(tmp_path: Path) -> None:
             decode(tmp_path / name)
     Image.fromarray(values / np.float32(65535)).save(tmp_path / "float.tif")
     assert (np.asarray(decode(tmp_path / "float.tif", span=()))[..., 0].ravel() == np.arange(256)).all()
+    assert [span_of(ImageRef(str(tmp_path / name))) for name in ("float.tif", "deep.png")] == [(0, 1), (0, 65535)]
     Image.fromarray(np.zeros((9, 9, 3), np.uint8)).save(tmp_path / "rgb.png")
     with pytest.raises(ValueError, match="read as RGB of 8 bits"):
         decode(tmp_path / "rgb.png", span=(0, 2040))
@@ -271,8 +276,10 @@ def test_sixteen_bits_are_scaled_not_clipped(tmp_path: Path) -> None:
     parts = (b"IHDR", head), (b"IDAT", zlib.compress(bytes(26))), (b"IEND", b"")
     chunks = (struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in parts)
     (tmp_path / "deep.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
-    with pytest.raises(ValueError, match="16 bits a colour"):
-        decode(tmp_path / "deep.png")
+    (tmp_path / "deep.ppm").write_bytes(b"P6 2 2 1023\n" + bytes(24))
+    for name in ("deep.png", "deep.ppm"):
+        with pytest.raises(ValueError, match="16 bits a colour"):
+            decode(tmp_path / name)
 
 
 def test_gray_palette_bilevel_and_alpha_become_rgb(tmp_path: Path) -> None:

@@ -284,6 +284,8 @@ def test_python_scores_as_the_command_does(run: Path, turned: Pack) -> None:
 SAID = [
     ("ImageNet-1k", ""),
     ("ImageNet-1k; Toy", "toy was in its owner's training, which rows is not known"),
+    ("ToyImages", "toy was in its owner's training, which rows is not known"),
+    ("web stories", ""),
     ("", UNKNOWN),
     (" ", UNKNOWN),
     ("Unknown", UNKNOWN),
@@ -322,6 +324,7 @@ def test_other_names_of_the_data_count_too(pack: Pack, tmp_path: Path) -> None:
     scored, rows = Scored(pack), pack.rows("test")
     assert scored.leak([source], rows) == "" and "TAG, Touch-and-Go" not in scored.leak([source], rows)
     assert scored.leak([source], rows, ["TAG", "touch-and-go"]).startswith("touch-and-go was in its owner's training")
+    assert scored.leak([source], rows, ["hand", "own"]) == ""  # parts of words
 
 
 def test_what_timm_says_of_its_weights() -> None:

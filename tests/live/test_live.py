@@ -412,7 +412,7 @@ def test_a_full_disk_ends_the_recording_only(tmp_path: Path, monkeypatch: pytest
 
 
 def test_a_recording_survives_a_crash(tmp_path: Path) -> None:
-    out = tmp_path / "it's \"q\" \u00f6"
+    out = tmp_path / 'it\'s "q" \u00f6'
     recorder, image = Recorder(out, fps=1.0), np.zeros((16, 16, 3), np.uint8)
     for i in range(130):
         recorder({"touch": image + i}, {"time": float(i), "contact": i % 2 == 0, "touch_number": i // 2})

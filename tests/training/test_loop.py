@@ -119,6 +119,9 @@ def test_a_log_ends_before_what_is_none(tmp_path: Path) -> None:
 def test_killed_between_two_checkpoints(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
     run = cut_after(5, pack, tmp_path / "r")
     os.replace(tmp_path / "r" / CHECKPOINT, tmp_path / "r" / PREVIOUS)
+    other = pack.with_splits({"split": pack.column("split")[::-1]})
+    with pytest.raises(ValueError, match=r"different run \(other settings or data\)"):
+        train(run, tmp_path / "r", resume=True, quiet=True, pack=other)
     with power_cut(4):  # steps 5 to 8 and no more
         train(run, tmp_path / "r", resume=True, quiet=True)
     assert_equal_weights(smoke_run, tmp_path / "r")

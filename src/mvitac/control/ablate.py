@@ -197,6 +197,7 @@ def act(
         world, seen, step = begin(), deque(maxlen=LAG + 1), 0
         while not world.over:
             given = {**getattr(world, "values", {}), "step": step, **{each: world.look(each) for each in world.senses}}
+            given = copy.deepcopy(given)  # a task, a policy and a step may each fill one buffer again and again
             if replaced:
                 seen.append(given[sense])
                 given[sense] = replaced(number, step, seen[0])
@@ -207,7 +208,7 @@ def act(
             if len(action) != width:
                 raise ValueError(f"the policy gives {len(action)} numbers, episodes have actions of {width}")
             actions.append(action)
-            world.step(action)
+            world.step(action.copy())
             step += 1
         if not step or not np.isfinite(world.loss):
             raise ValueError(f"episode {number + 1} has {f'a loss of {world.loss}' if step else 'no step'}")
@@ -220,7 +221,7 @@ def _action(policy: Policy, given: dict[str, Any], number: int) -> np.ndarray:
     """What ``policy`` answers [T]; ValueError if that is not finite numbers, or it raises anything."""
     place = f"in step {given['step']} of episode {number + 1}"
     own = copy.deepcopy(given)  # which it may change in place
-    action = _given(lambda: np.asarray(policy(own), float).ravel(), place)
+    action = _given(lambda: np.array(policy(own), float).ravel(), place)
     if not (np.abs(action) < MOST).all():
         raise ValueError(f"the policy gives {action} {place}: give finite numbers below {MOST:g}")
     return action

@@ -8,7 +8,8 @@ a shroud hides the peg from it.
 Units: metres and radians inside, mm and degrees in names and results.
 """
 
-# pyright: reportAttributeAccessIssue=false  # mujoco is a binary module without stubs
+# mujoco is a binary module without stubs:
+# pyright: reportAttributeAccessIssue=false
 
 import math
 from collections.abc import Sequence

@@ -52,7 +52,9 @@ def decode(path: str | Path | BinaryIO, name: str = "", span: Sequence[float] | 
         with Image.open(path, formats=FORMATS) as image:
             if image.width * image.height > MAX_PIXELS:
                 raise ValueError(f"it has {image.width} x {image.height} pixels: at most {MAX_PIXELS:,} are read")
-            if any(";16" in str(tile[3]) for tile in image.tile) and not image.mode.startswith("I"):
+            many = (tile[0][:3] == "ppm" and int(tile[3][1]) > 255 for tile in image.tile)  # type: ignore[index, arg-type]
+            deep = any(many) or any(";16" in str(tile[3]) for tile in image.tile)
+            if deep and not image.mode.startswith("I"):
                 raise ValueError("it has 16 bits a colour, of which half would be lost: convert it to 8 bits")
             # A camera's MPO has a second image after the photo; GIF and TIFF stacks are refused.
             if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":

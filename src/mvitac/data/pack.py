@@ -46,6 +46,8 @@ class Pack:
         >>> pack.images["touch"][pack.rows("test")]
     """
 
+    config: Any = None
+    """The dataset's settings that it was opened by (``DatasetConfig.open``)."""
     parts: "Mapping[str, Pack]" = MappingProxyType({})
     """Name -> pack, for several packs that are opened as one (``data/several``)."""
 

@@ -93,9 +93,11 @@ class DatasetConfig(Registered):
         """
         pack = self._frames(quiet)
         try:
-            return windowed(pack, self.frame_window())
+            made = windowed(pack, self.frame_window())
         except ValueError as error:  # nobody knows the cache's folder
             raise ValueError(str(error).replace(str(pack.path), str(getattr(self, "path", self.name)))) from None
+        made.config = self
+        return made
 
     def _frames(self, quiet: bool) -> Pack:
         source = self.source()

@@ -9,6 +9,7 @@ them. A run that starts from another model's weights adds the sources of that mo
 of which only their owner, or nothing, says what they were trained on. run.json has the digest too: the list is of this run.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -145,14 +146,16 @@ def declared_leak(trained_on: str | None, names: Sequence[str]) -> str:
 
     ``UNKNOWN`` if the owner does not. Blanks, signs and upper case do not count: "Touch and Go" is "touch-and-go".
     """
-    said = [*map(_letters, (trained_on or "").split(";"))]
-    if named := [name for name in names if _letters(name) and _letters(name) in "".join(said)]:
+    said = [" ".join(_words(part)) for part in (trained_on or "").split(";")]
+    asked = {name: " ?".join("".join(_words(name))) for name in names if _words(name)}
+    if named := [name for name, letters in asked.items() if any(re.search(rf"\b{letters}\b", part) for part in said)]:
         return f"{named[0]} was in its owner's training, which rows is not known"
     return UNKNOWN if UNKNOWN in said or not any(said) else ""
 
 
-def _letters(text: str) -> str:
-    return "".join(filter(str.isalnum, text.lower()))
+def _words(text: str) -> list[str]:
+    """Words and numbers in lower case: ImageNet1k is "image", "net", "1", "k"."""
+    return re.findall(r"[^\W\d_]+|\d+", re.sub("(?<=[a-z])(?=[A-Z])", " ", text).lower())
 
 
 def leak_mark(leak: str) -> str:

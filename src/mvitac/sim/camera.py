@@ -6,7 +6,8 @@ each grasp and independent of the outcome.
 Shapes: P rays (pixels times samples). Colours are linear RGB in [0, 1] until the last step. Units: metres, radians.
 """
 
-# pyright: reportAttributeAccessIssue=false  # mujoco is a binary module without stubs
+# mujoco is a binary module without stubs:
+# pyright: reportAttributeAccessIssue=false
 
 from typing import Any
 

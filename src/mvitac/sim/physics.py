@@ -3,7 +3,8 @@
 Frames and units as in :mod:`mvitac.sim.objects`: metres, kilograms, newtons, radians, seconds.
 """
 
-# pyright: reportAttributeAccessIssue=false  # mujoco is a binary module without stubs
+# mujoco is a binary module without stubs:
+# pyright: reportAttributeAccessIssue=false
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -39,6 +39,7 @@ from mvitac.training.step import Step
 from mvitac.training.views import StepViews, values_of
 
 T = TypeVar("T")
+DIFFERENT = "holds a different run (other settings or data): give the same ones, or another --out"
 
 
 @dataclass(frozen=True)
@@ -106,9 +107,13 @@ def _record(setup: Setup, asked: Run, out: Path, start: Start | None, taken: dic
     before = [*(start.sources if start else []), *map(leaks.file_source, leaks.weights_files(run))]
     own, *others = leaks.with_ancestors(leaks.source_of(pack, setup.rows), before)
     sources = [own, *([leaks.source_of(pack, val, leaks.CHOSE)] if len(val) else []), *others]
-    if not (out / "run.json").exists():
+    learned = leaks.sources_digest(sources)
+    if (out / "run.json").exists():
+        if load_run(out)[1].get(leaks.LEARNED) != learned:
+            raise ValueError(f"{out} {DIFFERENT}")
+    else:
         record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(setup.spec)}
-        record |= {leaks.LEARNED: leaks.sources_digest(sources)}
+        record |= {leaks.LEARNED: learned}
         record |= {"device": describe(setup.hardware.device), "precision": run.precision}
         record["bf16_slowdown"], said = setup.hardware.slowdown, []
         if used := [m for m in setup.method.encoders() if run.encoder[m].weights == IMAGENET]:
@@ -167,7 +172,7 @@ def check_same(run: Run, pack: Pack, out: Path) -> None:
     begun = precision_of(old, record)
     same = replace(run, precision=begun) if run.precision == "auto" else run
     if replace(old, precision=begun).digest() != same.digest() or record.get("pack") != pack.digest:
-        raise ValueError(f"{out} holds a different run (other settings or data): give the same ones, or another --out")
+        raise ValueError(f"{out} {DIFFERENT}")
 
 
 def _hardware(run: Run, pack: Pack, device: torch.device, world: World, begun: Path | None) -> Hardware:

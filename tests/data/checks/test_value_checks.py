@@ -79,9 +79,9 @@ def test_healthy_values(healthy: Pack) -> None:
 @pytest.mark.parametrize(
     ("fault", "item", "says", "rows"),
     [
-        ("outlier", "values of force", "16 outliers, e.g. -999 in row 5", [5, 45]),
+        ("outlier", "values of force", "16 outliers, e.g. -999 in row 00-05 ", [5, 45]),
         ("placeholder", "values of force", "80 of 640 (12.5 %) rows have -1 exactly", [5, 13]),
-        ("stuck", "values of force", "1 constant stretches, the longest 14 frames of 2 from row 170", [170]),
+        ("stuck", "values of force", "1 constant stretches, the longest 14 frames of 2 from row 04-10", [170]),
         ("outside", "values of force", "test rows are outside train (0.1", []),
     ],
 )
@@ -96,6 +96,12 @@ def test_two_recordings_in_one_touch_hide_no_stuck_sensor_of_another(tmp_path: P
     pack = packed(tmp_path / "pack", "stuck")
     together = ["0" if name == "1" else name for name in pack.column("touch_group")]
     assert "1 constant stretches" in value_checks.values(with_columns(pack, touch_group=together))[0].evidence
+
+
+def test_val_is_not_train(tmp_path: Path) -> None:
+    pack = packed(tmp_path / "pack", "outside")
+    halved = ["val" if split == "test" and i % 2 else split for i, split in enumerate(pack.column("split"))]
+    assert "test rows are outside train (0.1" in value_checks.values(with_columns(pack, split=halved))[0].evidence
 
 
 def test_missing_values(tmp_path: Path) -> None:

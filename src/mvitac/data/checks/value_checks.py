@@ -37,10 +37,12 @@ def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, tou
     if missing := sum(map(len, sides.values())) - len(rows):
         evidence.append(f"{share(missing, missing + len(rows))} rows of train, val and test have none")
     checks = {
-        "repair these cells, or leave them empty": _outliers(rows, known),
+        "repair these cells, or leave them empty": _outliers(rows, known, pack.own_ids),
         "a placeholder or a saturated sensor: leave these cells empty": _placeholder(rows, known),
-        "a stuck or saturated sensor: leave these cells empty": _stuck(found, touches),
-        "expect larger errors there, or split so that train covers test": _outside(found, measured, target),
+        "a stuck or saturated sensor: leave these cells empty": _stuck(found, touches, pack.own_ids),
+        "expect larger errors there, or split so that train covers test": _outside(
+            found, pack.rows("train", only=task.only, by=task.split), measured["test"], target
+        ),
     }
     wrong = {advice: note for advice, note in checks.items() if note[0]}
     evidence += [text for text, _ in wrong.values()]
@@ -60,7 +62,7 @@ def _touches(pack: Pack) -> list[np.ndarray]:
         return []
 
 
-def _outliers(rows: np.ndarray, known: np.ndarray) -> Note:
+def _outliers(rows: np.ndarray, known: np.ndarray, ids: np.ndarray) -> Note:
     """At most 5 % of the values, beyond a gap twice as wide as the range of the others: such as -999 for "not measured"."""
     far, num = np.zeros(len(known), bool), max(1, len(known) // 20)
     for side in (known, -known):
@@ -71,7 +73,7 @@ def _outliers(rows: np.ndarray, known: np.ndarray) -> Note:
     if not far.any():
         return "", []
     usual = f"(the others are {known[~far].min():.4g} to {known[~far].max():.4g})"
-    return f"{int(far.sum())} outliers, e.g. {known[far][0]:.4g} in row {rows[far][0]} {usual}", rows[far].tolist()
+    return f"{int(far.sum())} outliers, e.g. {known[far][0]:.4g} in row {ids[rows[far][0]]} {usual}", rows[far].tolist()
 
 
 def _placeholder(rows: np.ndarray, known: np.ndarray) -> Note:
@@ -84,7 +86,7 @@ def _placeholder(rows: np.ndarray, known: np.ndarray) -> Note:
     return (f"{share(len(at), len(known))} rows have {value:.4g} exactly", rows[at].tolist()) if value else ("", [])
 
 
-def _stuck(found: np.ndarray, touches: list[np.ndarray]) -> Note:
+def _stuck(found: np.ndarray, touches: list[np.ndarray], ids: np.ndarray) -> Note:
     """Stretches of one recording with the same value other than 0, which is what no contact measures."""
     parts: list[np.ndarray] = []
     for rows in (rows[np.isfinite(found[rows])] for rows in touches):
@@ -96,11 +98,12 @@ def _stuck(found: np.ndarray, touches: list[np.ndarray]) -> Note:
         return "", []
     longest = max(stretches, key=len)
     text = f"{len(stretches)} constant stretches, the longest {len(longest)} frames of {found[longest[0]]:.4g}"
-    return f"{text} from row {longest[0]}", [int(part[0]) for part in stretches]
+    return f"{text} from row {ids[longest[0]]}", [int(part[0]) for part in stretches]
 
 
-def _outside(found: np.ndarray, measured: dict[str, np.ndarray], target: Target) -> Note:
-    train, test = found[measured["train"]], measured["test"]
+def _outside(found: np.ndarray, rows: np.ndarray, test: np.ndarray, target: Target) -> Note:
+    if not len(train := found[rows][np.isfinite(found[rows])]):
+        return "", []
     margin = 0.05 * (train.max() - train.min())
     beyond = test[(found[test] < train.min() - margin) | (found[test] > train.max() + margin)]
     if len(beyond) <= 0.01 * len(test):

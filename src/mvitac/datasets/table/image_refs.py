@@ -224,7 +224,7 @@ def span_of(ref: ImageRef) -> tuple[float, ...]:
         if isinstance(found, np.ndarray):
             return () if found.dtype == np.uint8 else ref.span or _usual(found.dtype)
         with Image.open(found if isinstance(found, str) else io.BytesIO(found)) as image:
-            return () if image.mode[0] not in "IF" else ref.span or (0, 65535)
+            return () if image.mode[0] not in "IF" else ref.span or ((0, 1) if image.mode == "F" else (0, 65535))
     return ()
 
 

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mvitac.datasets.table.image_refs import ParquetCell, Refs
-from mvitac.datasets.table.manifest import Manifest, Row, text_of
+from mvitac.datasets.table.manifest import Manifest, Row, listed, text_of
 from mvitac.system.files import brief, check_ordinary, parse_json
 
 NAMES = {"train": "train training", "val": "val validation valid dev", "test": "test testing eval evaluation"}
@@ -57,7 +57,7 @@ def add_file(
         texts = [name for name in flat if name not in images]
         for group in range(opened.num_row_groups if images or cameras is not None else 0):
             num = opened.metadata.row_group(group).num_rows
-            table = opened.read_row_group(group, columns=texts).to_pylist() if texts else [{}] * num
+            table = listed(opened.read_row_group(group, columns=texts)) if texts else [{}] * num
             rows += [{name: _text(value, classes.get(name)) for name, value in values.items()} for values in table]
             for column in (column for column in images if cameras is None or column in cameras):
                 there = _there(opened, group, column, num)
