@@ -16,7 +16,7 @@ from mvitac.bench.external.model import is_noncommercial, randomised
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
-from mvitac.evaluation.features import features
+from mvitac.evaluation.features import features, pack_features
 from mvitac.evaluation.probe import probe_model
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.model import fresh
@@ -90,6 +90,7 @@ def test_sensors_are_encoded_one_by_one(pack: Pack, tmp_path: Path) -> None:
 
 
 FACTORY = """
+import time
 import torch
 from torch import nn
 
@@ -146,6 +147,19 @@ def wrong():
 def six():
     return nn.Conv2d(6, 5, 4, 4), {}
 
+class Buffer(nn.Module):
+    out, busy = torch.zeros(128, 3), False
+    def forward(self, x):
+        assert not self.busy
+        self.busy = True
+        time.sleep(0.005)
+        self.out[: len(x)] = x.mean((2, 3))
+        self.busy = False
+        return self.out[: len(x)]
+
+def buffer():
+    return Buffer(), {"size": 16, "mean": (0, 0, 0), "std": (1, 1, 1)}
+
 def nothing():
     return type("Nothing", (nn.Module,), {"forward": lambda self, x: x[:, :0, 0, 0]})(), {}
 """
@@ -188,6 +202,14 @@ def test_python_functions(pack: Pack, functions: str) -> None:
     ):
         with pytest.raises(ValueError, match=words):
             open_model(f"{functions}{name}")
+
+
+def test_one_buffer_for_all_features_and_one_call_at_a_time(pack: Pack, functions: str, two_threads: None) -> None:
+    rows, images = np.tile(np.arange(pack.num), 3), pack.images["touch"][:]
+    model = open_model(f"{functions}buffer,size=32").on(pack)[0]
+    expected = torch.from_numpy(images / np.float32(255)).mean((1, 2))
+    torch.testing.assert_close(pack_features(model, pack, "touch", rows), expected[rows])
+    torch.testing.assert_close(model.embed(touch=images)["touch"], expected)
 
 
 def test_windows_are_opened_where_the_data_has_an_order(pack: Pack, tmp_path: Path, functions: str) -> None:

@@ -155,6 +155,7 @@ def test_episodes_may_end_when_the_policy_is_done() -> None:
     """Two and four steps in turn, or with the gel of the next episode four and two: changes of +2 and -2."""
     made = suite_episodes(replace(find_suite("insert-v1"), episodes=3), ("touch", "30"))
     own = replace(made, begin=[partial(Way, pace) for pace in [1, 2] * 3], senses=("touch",), unit="steps")
+    ablate(lambda o: [1.0], own)  # whose images are not those of the next
     found = ablate(lambda o: [o["touch"].mean()], own)
     rows = {row["kind"]: row for row in found["rows"]}
     assert found["error"][0] == 3 and rows["another episode"]["error"][0] == 0 == rows["10 frames ago"]["error"][0]

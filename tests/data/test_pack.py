@@ -50,6 +50,9 @@ def test_a_packing_process_has_one_thread(monkeypatch: Any) -> None:
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     # 16 processes of 16 threads each took four times as long per image on a machine with a GPU.
     assert set(chain(*read_parts(threads_of, [(0, 1), (1, 2)], workers=2))) == {1}
+    monkeypatch.setattr("tempfile.NamedTemporaryFile", lambda **_: io.FileIO("/dev/full", "w"))
+    with pytest.raises(OSError, match="No space left on device: '/dev/full'"):
+        [*read_parts(threads_of, [(0, 1), (1, 2)], workers=2)]
 
 
 @contextmanager

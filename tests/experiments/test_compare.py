@@ -501,6 +501,11 @@ def test_the_command_from_dry_run_to_tables(pack: Pack, tmp_path: Path, capsys: 
     assert main([*words, "--dry-run"]) == 0
     shown = capsys.readouterr().out
     assert "2 rows x 1 seeds = 2 runs" in shown and not (tmp_path / "out").exists() and "2 runs left" in shown
+    (own := tmp_path / "out/table.csv").parent.mkdir()
+    own.write_text("mine")
+    assert main(words) == 2 and "is not empty, and holds no comparison" in capsys.readouterr().err
+    assert own.read_text() == "mine"
+    own.unlink()
     assert main([*words, "--tables-only"]) == 2 and "no run of" in capsys.readouterr().err
     assert main([*words, "--set", "steps=1", "--seeds", "1"]) == 0
     shown = capsys.readouterr().out

@@ -415,7 +415,10 @@ def test_a_recording_survives_a_crash(tmp_path: Path) -> None:
     out = tmp_path / 'it\'s "q" \u00f6'
     recorder, image = Recorder(out, fps=1.0), np.zeros((16, 16, 3), np.uint8)
     for i in range(130):
-        recorder({"touch": image + i}, {"time": float(i), "contact": i % 2 == 0, "touch_number": i // 2})
+        image[:] = i  # as a camera does that has one buffer
+        recorder({"touch": image}, {"time": float(i), "contact": i % 2 == 0, "touch_number": i // 2})
+    with pytest.raises(ValueError, match=r"\(9, 9, 3\).* after .*\(16, 16, 3\)"):
+        recorder({"touch": image[:9, :9]}, {"time": 130.0})
     del recorder  # killed: two of three parts are on disk
     with pytest.raises(ValueError, match="crashed and is finished by python -c") as refused:
         Recorder(out)

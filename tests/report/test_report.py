@@ -300,3 +300,6 @@ def test_scores_of_other_runs_or_data_are_refused(materials: Path, result: dict[
         write_report([other], tmp_path, result=result, quiet=True)
     with pytest.raises(ValueError, match=r"differ in .*run1"):
         write_report([materials / "run0"], tmp_path, result=result, quiet=True)
+    (tmp_path / "report.html").write_text("my thesis")
+    with pytest.raises(ValueError, match=r"report\.html is no report: choose another --out"):
+        write_report([other], tmp_path, quiet=True)

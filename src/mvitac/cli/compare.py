@@ -17,7 +17,7 @@ from mvitac.experiments.table_formats import write_tables
 from mvitac.recipes import RECIPES
 from mvitac.registry import check_known, to_json
 from mvitac.system.device import pick_device
-from mvitac.system.files import check_place, write_json
+from mvitac.system.files import SEAL, check_place, is_temporary, write_json
 from mvitac.system.locks import hold_lock
 
 
@@ -95,14 +95,18 @@ def compare(argv: list[str]) -> None:
     config = ProbeConfig(probes=plan.probes, tasks=plan.tasks, modalities=plan.modalities)
     if options.dry_run and options.tables_only:
         raise ValueError("--tables-only has no effect beside --dry-run: leave one out")
+    kept = options.out / "plan.json"
     if not options.dry_run:
-        check_place(options.out / "plan.json")
+        check_place(kept)
+        own = kept.is_file() and SEAL in kept.read_text(errors="replace")
+        if not own and options.out.is_dir() and not all(map(is_temporary, options.out.iterdir())):
+            raise ValueError(f"{options.out} is not empty, and holds no comparison: choose another --out")
     works = lay_out_folds(plan, options.out, config, options.device)
     work = together(works)
     print("\n".join(outline(work)), flush=True)
     if options.dry_run:
         return
-    write_json(options.out / "plan.json", to_json(plan))
+    write_json(kept, to_json(plan), sealed=True)
     if not options.tables_only:
         do_all(work)
     with hold_lock(options.out / "tables", "waiting for the tables of another process", wait=True):

@@ -264,9 +264,9 @@ def ablate(policy: Policy, episodes: Episodes) -> dict[str, Any]:
 
     rows: list[dict[str, Any]] = []
     with work("acting", 1 + len(episodes.senses) * len(KINDS), "times") as advance:
-        normal, own, steps = act(policy, episodes, watch=None if episodes.images else keep)
+        normal, own, steps = act(policy, episodes, watch=keep if episodes.actions is None else None)
         advance()
-        if not episodes.images:
+        if episodes.actions is None:  # also where they are of another policy
             episodes.images, episodes.rows = {sense: np.stack(images) for sense, images in seen.items()}, steps
         wanted = normal if episodes.actions is None else episodes.actions
         still = np.nanmax(wanted, axis=0) == np.nanmin(wanted, axis=0)

@@ -24,7 +24,7 @@ from mvitac.data.jpeg import encode
 from mvitac.data.pack_table import check_table
 from mvitac.data.source import Lost, Sample, Source
 from mvitac.data.spec import DataSpec
-from mvitac.system.files import brief
+from mvitac.system.files import brief, naming
 from mvitac.system.malloc import keep_freed_memory
 
 
@@ -115,8 +115,9 @@ def read_parts(
         ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker, (file.name,)) as pool,
     ):
         # In a file: the pipe to a new process is blocked for ever if that process ends before it has read all.
-        file.write(pickle.dumps(reader))
-        file.flush()
+        with naming(Path(file.name)):
+            file.write(pickle.dumps(reader))
+            file.flush()
         try:
             for part in parts:
                 signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # also in processes that the first one starts

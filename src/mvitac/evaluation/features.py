@@ -115,7 +115,8 @@ def pack_features(
         return values
 
     chunks = np.array_split(rows, max(1, len(rows) // size))
-    return torch.cat(in_threads(read_chunk, chunks) if device.type == "cpu" else list(map(read_chunk, chunks)))
+    several = device.type == "cpu" and model.thread_safe
+    return torch.cat(in_threads(read_chunk, chunks) if several else list(map(read_chunk, chunks)))
 
 
 def _folded(model: Model, modality: str) -> Model:

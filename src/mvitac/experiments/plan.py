@@ -13,7 +13,7 @@ from mvitac.methods.base import MethodConfig
 from mvitac.recipes import recipe, with_method
 from mvitac.registry import check_known, check_range, default, from_json, to_json, unknown
 from mvitac.run import Run
-from mvitac.system.files import brief, parse_json, parse_toml
+from mvitac.system.files import SEAL, brief, parse_json, parse_toml
 
 PLANS = ("table1", "table2", "ablation", "recipes")
 Printed = dict[str, dict[str, float]]  # modality -> task -> top-1 accuracy in percent as printed in the paper
@@ -137,6 +137,7 @@ def find_plan(given: str) -> Plan:
         raise ValueError(f"plan {given} is not valid {path.suffix[1:].upper()}: {brief(error)}") from None
     if not isinstance(value, dict):
         raise ValueError(f"plan {given}: expected an object with name and rows")
+    value.pop(SEAL, None)  # of a comparison's plan.json
     return from_json(Plan, {"name": path.stem, **value}, "plan")
 
 

@@ -43,6 +43,7 @@ class Recorder:
         self.spool.mkdir(parents=True)
         self.waiting: list[tuple[dict[str, np.ndarray], dict[str, Any]]] = []
         self.num, self._next = 0, float("-inf")
+        self.shapes: dict[str, tuple[int, ...]] = {}
 
     def __call__(self, images: dict[str, np.ndarray], columns: dict[str, Any]) -> None:
         """Keep a pair (uint8 [S, S, C]) if it is due; ``columns`` has at least time, contact and touch_number."""
@@ -53,7 +54,11 @@ class Recorder:
         self._next += self.every
         if time >= self._next:
             self._next = time + self.every
-        self.waiting.append((images, {**columns, **self.named}))
+        shapes = {m: image.shape for m, image in images.items()}
+        self.shapes = self.shapes or shapes
+        if shapes != self.shapes:
+            raise ValueError(f"images of {shapes} after {self.shapes}: record each size into a folder of its own")
+        self.waiting.append(({m: np.array(image) for m, image in images.items()}, {**columns, **self.named}))
         if len(self.waiting) == SPOOL:
             self._flush()
 

@@ -23,6 +23,8 @@ from mvitac.system.files import write_atomic
 from mvitac.system.progress import shown, work
 from mvitac.training.log import read_log
 
+WRITTEN = "Written by mvitac"
+
 
 def write_report(
     paths: Sequence[Path],
@@ -38,6 +40,9 @@ def write_report(
     is complete (``stored_result``), else they are probed here, with logistic regression, all tasks and all controls.
     ``pack`` is shown instead of the runs' own. ValueError if a run is unfinished, or ``result`` is about others.
     """
+    place = Path(out) / "report.html"
+    if place.exists() and WRITTEN not in place.read_text(errors="replace"):
+        raise ValueError(f"{place} is no report: choose another --out")
     runs = open_runs(paths)
     if pack is None and len({r.record.get("pack") for r in runs}) > 1:
         raise ValueError("these runs were trained on different data: write one report per dataset")
@@ -56,8 +61,8 @@ def write_report(
         raise ValueError(f"the probe result and the report differ in {names}: probe them again")
     with shown(quiet=quiet):
         html = _page(Study(runs, pack, result, Path(out)))
-    write_atomic(Path(out) / "report.html", lambda file: file.write(html.encode()))
-    return Path(out) / "report.html"
+    write_atomic(place, lambda file: file.write(html.encode()))
+    return place
 
 
 def open_runs(paths: Sequence[Path]) -> list[Finished]:
@@ -99,7 +104,7 @@ def _page(study: Study) -> str:
     foot = (
         f"Data: {spec.name}, from {spec.source}; licence {spec.licence}.{notes}"
         f" 95 % intervals: {covered(spec.group_by, study.result['records'])}."
-        f" Written by mvitac {__version__}; this page makes no network request."
+        f" {WRITTEN} {__version__}; this page makes no network request."
     )
     return str(page.page(title, _head(study, title), [section for section in drawn if section[2]], foot))
 

@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor, nn
 
-from mvitac.bench.external.adapters import ABOUT, NOTHING, RANDOM, UNKNOWN, Adapter, Loaded, parse
+from mvitac.bench.external.adapters import ABOUT, NOTHING, RANDOM, UNKNOWN, Adapter, Loaded, Timm, parse
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec, Window
 from mvitac.data.windows import windowed
@@ -70,7 +70,8 @@ class ExternalEncoder(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         each = images.unflatten(1, (self.frames, self.sensors, 3)).transpose(1, 2).flatten(0, 1)  # [B S, F, 3, H, W]
-        return self.network(self.preprocessing(each)).float().unflatten(0, (-1, self.sensors)).flatten(1)
+        found = self.network(self.preprocessing(each)).float().clone()  # whose memory may be the network's own
+        return found.unflatten(0, (-1, self.sensors)).flatten(1)
 
 
 def randomised(network: nn.Module, seed: int) -> nn.Module:
@@ -106,6 +107,7 @@ class ExternalModel(Model):
         for modality in (m for m in spec.modalities if part.adapter.reads in (m, "both")):
             sensors = max(1, spec.channels(modality) // 3 // spec.frames(modality))
             self.parts[modality] = part.bound(sensors, spec.frames(modality))
+        self.thread_safe = isinstance(part.adapter, Timm)
         self.alone: set[str] = set()  # modalities whose features were seen to be those of one image alone
         self.stored = stored or max(part.preprocessing.size)
         self.encoders = nn.ModuleDict(self.parts)
