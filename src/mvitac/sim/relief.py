@@ -84,10 +84,6 @@ def _sin(a: F) -> F:
     return np.sin(a * np.float32(2 * np.pi))
 
 
-def _blotch(u: F, v: F, t: F) -> F:
-    return fractal(u, v, t[0], 4, 0.6)
-
-
 def _pores(u: F, v: F, t: F) -> F:
     first, _, owner = cells(u, v, t)
     return np.minimum(first * (1.6 + 0.5 * t[2].ravel()[owner]), 1.0) + 0.25 * noise(2.3 * u, 2.3 * v, t[3])
@@ -128,10 +124,6 @@ def _tiles(u: F, v: F, t: F) -> F:
     return np.minimum(0.5 - np.maximum(du, dv), 0.1) * 8 + 0.12 * noise(1.7 * u, 1.7 * v, t[3])
 
 
-def _brushed(u: F, v: F, t: F) -> F:
-    return noise(0.12 * u, 1.8 * v, t[0]) + 0.7 * noise(0.2 * u, 3.7 * v + 9, t[1])
-
-
 def _wood(u: F, v: F, t: F) -> F:
     ring = 0.8 * v + 0.9 * noise(0.22 * u, 0.45 * v, t[0])
     return _sin(ring) + 0.4 * _sin(2 * ring + 0.2) + 0.45 * noise(0.25 * u, 4 * v, t[1])
@@ -158,14 +150,6 @@ def _fibres(u: F, v: F, t: F) -> F:
     return -np.minimum.reduce(layers)
 
 
-def _emboss(u: F, v: F, t: F) -> F:
-    return np.tanh(3.5 * noise(1.4 * u, 1.4 * v, t[0])) + 0.2 * noise(3 * u, 3 * v, t[1])
-
-
-def _studs(u: F, v: F, t: F) -> F:
-    return np.cos(2 * np.pi * 0.7 * (u + v)) * np.cos(2 * np.pi * 0.7 * (u - v)) + 0.15 * noise(u, v, t[0])
-
-
 def _weave(u: F, v: F, t: F) -> F:
     over = _sin(0.5 * u) * _sin(0.5 * v) > 0
     warp, weft = np.abs(_sin(0.5 * u)), np.abs(_sin(0.5 * v))
@@ -178,13 +162,16 @@ def _rib(u: F, v: F, t: F) -> F:
     return ridge + 0.22 * _sin(1.6 * u + 2 * np.abs(v - np.floor(v) - 0.5))
 
 
-def _plain(u: F, v: F, t: F) -> F:
-    return noise(0.45 * u, 0.45 * v, t[0]) + 0.12 * noise(5 * u, 5 * v, t[1])
-
-
-_CELLS = (_blotch, _pores, _grains, _pebbles, _facets, _crackle, _brick, _tiles)
-_LINES = (_brushed, _wood, _fissures, _blades, _veins, _fibres, _emboss, _studs, _weave, _rib, _plain)
-KINDS: dict[str, Callable[[F, F, F], F]] = {draw.__name__[1:]: draw for draw in (*_CELLS, *_LINES)}
+_CELLS = (_pores, _grains, _pebbles, _facets, _crackle, _brick, _tiles)
+_LINES = (_wood, _fissures, _blades, _veins, _fibres, _weave, _rib)
+KINDS: dict[str, Callable[[F, F, F], F]] = {
+    **{draw.__name__[1:]: draw for draw in (*_CELLS, *_LINES)},
+    "blotch": lambda u, v, t: fractal(u, v, t[0], 4, 0.6),
+    "brushed": lambda u, v, t: noise(0.12 * u, 1.8 * v, t[0]) + 0.7 * noise(0.2 * u, 3.7 * v + 9, t[1]),
+    "emboss": lambda u, v, t: np.tanh(3.5 * noise(1.4 * u, 1.4 * v, t[0])) + 0.2 * noise(3 * u, 3 * v, t[1]),
+    "plain": lambda u, v, t: noise(0.45 * u, 0.45 * v, t[0]) + 0.12 * noise(5 * u, 5 * v, t[1]),
+    "studs": lambda u, v, t: np.cos(1.4 * np.pi * (u + v)) * np.cos(1.4 * np.pi * (u - v)) + 0.15 * noise(u, v, t[0]),
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
