@@ -56,11 +56,8 @@ class Optim:
             return self.lr * (step + 1) / warm
         if self.schedule == "cosine":
             return self.lr * 0.5 * (1 + math.cos(math.pi * (step - warm) / max(1, num_steps - warm)))
-        if self.schedule == "step":
-            return self.lr * 0.9 ** (epoch // 10)
-        if self.schedule == "late-step":
-            return self.lr * 0.9 ** max(0, epoch // 10 - 1)
-        return self.lr
+        times = {"step": epoch // 10, "late-step": max(0, epoch // 10 - 1)}
+        return self.lr * 0.9 ** times.get(self.schedule, 0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,10 +4,8 @@ A pack stores every frame once. A window never crosses the edge of a touch (colu
 """
 
 import copy
-import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -15,6 +13,7 @@ from mvitac.data.images import difference
 from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Images, Pack
 from mvitac.data.spec import Window
+from mvitac.data.stamps import number_of
 from mvitac.registry import check_known
 from mvitac.system.files import digest
 
@@ -110,15 +109,10 @@ def places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
     asked = (window.order,) if window.order else ORDER
     if (name := next((column for column in asked if column in pack.table.column_names), None)) is None:
         raise ValueError(f"{pack.path} has no {', '.join(asked)} to order frames: name another --data.order")
-    place = np.array([_number(cell) for cell in pack.column(name)])
+    cells = pack.column(name)
+    text = cells.dtype.kind not in "biuf"
+    place = np.array([number_of(str(cell)) for cell in cells] if text else cells, float)  # None is NaN
     if not np.isfinite(place).all():
         row = int(np.flatnonzero(~np.isfinite(place))[0])
         raise ValueError(f"{pack.path}: column {name!r} is not a number in row {row}: give all rows one")
     return name, place
-
-
-def _number(cell: Any) -> float:
-    try:
-        return float(cell)
-    except (TypeError, ValueError):
-        return math.nan

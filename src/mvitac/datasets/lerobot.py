@@ -99,7 +99,7 @@ class LeRobotConfig(RecordedConfig):
         self, info: dict[str, Any], key: str, rows: Sequence[Row], episodes: dict[str, dict[str, Any]]
     ) -> list[ImageRef | None]:
         """Return the frame of camera ``key`` at each row's time; None if no frame is near enough."""
-        is_new = _is_new(info)
+        is_new = info["codebase_version"].startswith("v3")
         wanted: dict[str, list[int]] = {}
         for i, row in enumerate(rows):
             wanted.setdefault(row["episode"], []).append(i)
@@ -180,13 +180,9 @@ def _info(root: Path) -> dict[str, Any]:
     return info
 
 
-def _is_new(info: dict[str, Any]) -> bool:
-    return str(info["codebase_version"]).startswith("v3")
-
-
 def _episodes(root: Path, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Return what meta/episodes says of each episode; nothing if version 2 lacks the file."""
-    file = root / "meta" / ("episodes" if _is_new(info) else "episodes.jsonl")
+    file = root / "meta" / ("episodes" if info["codebase_version"].startswith("v3") else "episodes.jsonl")
     with fields_of(file):
         return {str(each["episode_index"]): each for each in _rows(file, ("episode_index", "length", "videos/"))}
 
@@ -216,7 +212,7 @@ def _numbers(root: Path, rows: Sequence[Row], name: str) -> np.ndarray:
 
 
 def _tasks(root: Path, info: dict[str, Any]) -> dict[str, str]:
-    file = root / "meta" / ("tasks.parquet" if _is_new(info) else "tasks.jsonl")
+    file = root / "meta" / ("tasks.parquet" if info["codebase_version"].startswith("v3") else "tasks.jsonl")
     with fields_of(file):
         pairs = [(str(row.pop("task_index")), row.popitem()[1]) for row in (_rows(file) if file.is_file() else [])]
         assert all(isinstance(text, str) for _, text in pairs), "a task that is no text"

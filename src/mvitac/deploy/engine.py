@@ -197,11 +197,8 @@ def _onnxruntime(path: Path, threads: int) -> Call:
 
 @functools.cache
 def _core() -> Any:
-    """OpenVINO's only core in this process.
-
-    Each that compiles sets the stack that signals are handled on, and when it goes, the stack before: of two, that may be
-    one that has gone, and Ctrl-C crashes.
-    """
+    """OpenVINO's only core in this process. Each that compiles sets the stack that signals are handled on, and when it
+    goes, the stack before: of two, that may be one that has gone, and Ctrl-C crashes."""
     # OpenVINO would report its import to an analytics host and keep an id in the home folder: without telemetry it cannot.
     sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
     import openvino

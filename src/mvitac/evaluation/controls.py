@@ -92,8 +92,7 @@ def _untrained(run: Run, runs: Sequence[Run]) -> Run:
     here = {
         m: imagenet.source(c.trunk) if c.weights == IMAGENET else Path(c.weights).is_file() for m, c in locked.items()
     }
-    kept = {m: config for m, config in locked.items() if here[m]}
-    return replace(run, encoder=replace(run.encoder.fresh(), **kept))
+    return replace(run, encoder=replace(run.encoder.fresh(), **{m: locked[m] for m in locked if here[m]}))
 
 
 def _named(source: str, seed: int | None, found: Records) -> Records:
@@ -183,8 +182,8 @@ def frozen_trunks(runs: Sequence[Run]) -> list[tuple[str, Run]]:
         views = runs[0].augment
         sides = {m: max(views.whole_of(m), IMAGENET_SIDE) for m in MODALITIES}
         views = replace(views, **{m: replace(views.of(m), whole=side) for m, side in sides.items()})
-        encoder = Encoders(vision=vision, touch=touch)
-        encoder = encoder.changed(pool="stages") if "stages" in (vision.pool, touch.pool) else encoder
+        pool = "stages" if "stages" in (vision.pool, touch.pool) else "last"
+        encoder = Encoders(vision=vision, touch=touch).changed(pool=pool)
         found.append(("imagenet", replace(runs[0], encoder=encoder, augment=views)))
     return found[::-1]
 

@@ -117,9 +117,7 @@ def encode_visible(
 
 def _pass(blocks: nn.Sequential, tokens: Tensor, live: Tensor | None) -> Tensor:
     """``tokens`` [B, L, D] through transformer blocks, in which no token attends to one that is not ``live`` [B, L]."""
-    mask = None
-    if live is not None:
-        mask = torch.zeros(live.shape, device=live.device).masked_fill(~live, -torch.inf)[:, None, None]
+    mask = None if live is None else torch.where(live, 0.0, -torch.inf)[:, None, None]
     for block in blocks:
         tokens = block(tokens, attn_mask=mask)
     return tokens

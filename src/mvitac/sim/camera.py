@@ -9,6 +9,7 @@ Shapes: P rays (pixels times samples). Colours are linear RGB in [0, 1] until th
 # mujoco is a binary module without stubs:
 # pyright: reportAttributeAccessIssue=false
 
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -18,7 +19,14 @@ from mvitac.sim import objects
 from mvitac.sim.physics import Bench
 
 SAMPLES = 2  # rays per pixel along each axis
-TABLES = ("plain", "checker", "planks", "marble", "dots")
+TABLES: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
+    "plain": lambda x, y: np.zeros(len(x)),
+    "checker": lambda x, y: ((np.floor(x) + np.floor(y)) % 2).astype(float),
+    "planks": lambda x, y: 0.5 + 0.3 * np.sin(9 * y + 1.5 * np.sin(0.7 * x)) - 0.5 * (np.abs(y - np.round(y)) < 0.05),
+    "marble": lambda x, y: 0.5 + 0.5 * np.sin(2 * x + 3 * np.sin(1.3 * y + np.sin(2.1 * x))),
+    "dots": lambda x, y: (np.hypot(x - np.round(x), y - np.round(y)) < 0.28).astype(float),
+}
+"""Pattern of a table -> the share of its second colour at x, y [P], in units of ``View.table_scale``."""
 VISIBLE = np.array([1, 1, 1, 0, 0, 0], np.uint8)
 """Geom groups that the camera sees; the collision bars of the fingers are not drawn."""
 
@@ -43,7 +51,7 @@ class View:
         self.lamp_color = tint * rng.uniform(0.7, 1.15)
         self.ambient = rng.uniform(0.18, 0.45)
         self.exposure = rng.uniform(0.75, 1.25)
-        self.table = str(rng.choice(TABLES))
+        self.table = str(rng.choice(list(TABLES)))
         color = rng.uniform(0.25, 0.85) * rng.normal(1, 0.12, 3)
         self.table_colors = np.clip([color, color * rng.uniform(0.7, 1.3) + rng.normal(0, 0.03, 3)], 0.02, 0.95)
         self.table_turn = rng.uniform(0, np.pi)
@@ -160,12 +168,8 @@ def _finishes(model: mujoco.MjModel, view: View) -> tuple[np.ndarray, np.ndarray
     """Return colour [geoms, 3], gloss [geoms] and emitted light [geoms] of gripper, gels, table and clutter."""
     color = np.tile(view.gripper_color, (model.ngeom, 1))
     gloss, glow = np.full(model.ngeom, 0.25), np.zeros(model.ngeom)
-    for i in range(model.ngeom):
-        name = model.geom(i).name
-        if name.endswith("_pad"):
-            color[i], glow[i] = view.gel_color, 0.6
-        elif name == "table":
-            gloss[i] = 0.05
+    pads = [model.geom(f"{side}_pad").id for side in ("left", "right")]
+    color[pads], glow[pads], gloss[model.geom("table").id] = view.gel_color, 0.6, 0.05
     mocap = model.body_mocapid[model.geom_bodyid]
     color[mocap >= 0] = view.clutter_colors[mocap[mocap >= 0]]
     return color, gloss, glow
@@ -176,18 +180,8 @@ def _table(view: View, points: np.ndarray) -> np.ndarray:
     cos, sin = np.cos(view.table_turn), np.sin(view.table_turn)
     x = (cos * points[:, 0] + sin * points[:, 1]) / view.table_scale
     y = (cos * points[:, 1] - sin * points[:, 0]) / view.table_scale
-    if view.table == "checker":
-        mix = ((np.floor(x) + np.floor(y)) % 2).astype(float)
-    elif view.table == "planks":
-        mix = 0.5 + 0.3 * np.sin(9 * y + 1.5 * np.sin(0.7 * x)) - 0.5 * (np.abs(y - np.round(y)) < 0.05)
-    elif view.table == "marble":
-        mix = 0.5 + 0.5 * np.sin(2 * x + 3 * np.sin(1.3 * y + np.sin(2.1 * x)))
-    elif view.table == "dots":
-        mix = (np.hypot(x - np.round(x), y - np.round(y)) < 0.28).astype(float)
-    else:
-        mix = np.zeros(len(x))
     first, second = view.table_colors
-    return first + (second - first) * mix[:, None]
+    return first + (second - first) * TABLES[view.table](x, y)[:, None]
 
 
 def _wall(view: View, rays: np.ndarray) -> np.ndarray:

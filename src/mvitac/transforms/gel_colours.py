@@ -63,9 +63,8 @@ def slope_colours(images: Float[np.ndarray, "N H W 3"]) -> tuple[np.ndarray, np.
 def learn_colours(images: np.ndarray) -> GelColours:
     """Learn the colours of slope of one sensor from images [N, H, W, 3] of different presses, or raise ValueError."""
     if len(images) < MIN_IMAGES:
-        raise ValueError(
-            f"{len(images)} images: the colours of a gel need {MIN_IMAGES} of different presses, better twice that"
-        )
+        few = f"{len(images)} images: the colours of a gel need {MIN_IMAGES} of different presses"
+        raise ValueError(f"{few}, better twice that")
     mean = images.mean(0, dtype=np.float64)
     level = mean.mean((0, 1))
     colours, mixtures, _ = slope_colours(images - mean)

@@ -21,7 +21,6 @@ MeanStd = tuple[tuple[float, ...], tuple[float, ...]]
 """Mean and standard deviation of R, G, B, by which levels in [0, 1] are normalised."""
 IMAGENET: MeanStd = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 
-LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, as PIL and torchvision use it
 NUM_TRIES = 10  # to draw a crop that fits, then the largest possible one, as in torchvision's RandomResizedCrop
 
 
@@ -195,7 +194,7 @@ def _normalisation(device: torch.device, mean_std: MeanStd) -> tuple[Tensor, Ten
 
 @lru_cache
 def _luma(device: torch.device) -> Tensor:
-    return torch.tensor(LUMA, device=device).view(3, 1, 1)
+    return torch.tensor((0.299, 0.587, 0.114), device=device).view(3, 1, 1)  # ITU-R BT.601, as of PIL and torchvision
 
 
 def _colour(sensors: Float[Tensor, "B N 3 S S"], drawn: Drawn) -> Float[Tensor, "B N 3 S S"]:

@@ -210,11 +210,13 @@ def _columns(
     demo: str, datasets: dict[str, Any], num: int, skip: Collection[str], vectors: Collection[str], left_out: LeftOut
 ) -> dict[str, list[str]]:
     """Return the texts of the datasets that are columns: one per row, or one for all; others go to ``left_out``."""
+    import h5py
+
     cells: dict[str, list[str]] = {}
     for name, data in datasets.items():
         if name in skip:
             continue
-        text = data.dtype.kind in "UT" or _is_text(data)
+        text = data.dtype.kind in "UT" or (hasattr(data, "asstr") and bool(h5py.check_string_dtype(data.dtype)))
         many = data.ndim > 2 or (data.ndim == 2 and data.shape[1] != 1 and name not in vectors)
         if many or (data.ndim and data.shape[0] != num) or (data.dtype.kind not in "biuf" and not text):
             needs = f"a column has a number or a text for each of the {num} images"
@@ -232,14 +234,6 @@ def _columns(
             texts = {number: text for text, number in enumeration.items()}
             cells[name] = [text_of(texts.get(v, v) if values.ndim == 1 else v) for v in values.tolist()]
     return cells
-
-
-def _is_text(data: Any) -> bool:
-    if "h5py" not in type(data).__module__:
-        return False
-    import h5py
-
-    return h5py.check_string_dtype(data.dtype) is not None
 
 
 def _constants(opened: Any, name: str, vectors: Collection[str]) -> dict[str, list[str]]:

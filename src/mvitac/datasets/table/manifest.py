@@ -6,7 +6,6 @@ Rows are counted from 1, without the header.
 
 import csv
 import json
-import math
 import os
 import re
 import unicodedata
@@ -156,9 +155,7 @@ class Manifest:
 
 def text_of(value: Any) -> str:
     """Return a cell as text, the same for each file format: whole numbers without '.0', NaN and null as ''."""
-    if value is None or (isinstance(value, float) and math.isnan(value)):
-        return ""
-    text = str(value).strip()
+    text = "" if value is None else str(value).strip()
     if text in NAN:
         return ""
     # pandas writes an integer column with a missing value as 1.0, 2.0, ...: these are the classes 1 and 2.

@@ -230,7 +230,7 @@ class Rows(Source):
         controls = config.control_columns()
         extra = columns.read_controls(table, dict.fromkeys(c for used in controls.values() for c in used), labels)
 
-        own: dict[str, Sequence[Any]] = {"id": table.ids(), "group": groups, "touch_group": touch_groups}
+        own: dict[str, list[Any]] = {"id": table.ids(), "group": groups, "touch_group": touch_groups}
         own |= {"split": assigned, **{f"label_{task.name}": label for task, label in read}}
         columns.check_names(table, [*values, *extra], {*own, "sensor"})
         own |= values | {f"has_{m}": [not lacks for lacks in lacking] for m, lacking in missing.items()}
@@ -344,11 +344,7 @@ class Rows(Source):
         return tuple(notes)
 
     def _make_rows(
-        self,
-        table: Manifest,
-        grounds: Sequence[Background],
-        own: dict[str, Sequence[Any]],
-        extra: dict[str, list[float]],
+        self, table: Manifest, grounds: Sequence[Background], own: dict[str, list[Any]], extra: dict[str, list[float]]
     ) -> list[Row]:
         """Combine the pack's ``own`` columns, the manifest's other columns and the controls' numbers (``extra``)."""
         if self._sensor:
