@@ -112,8 +112,7 @@ class Model(nn.Module):
         return result
 
     def _named(self, **images: Any) -> dict[str, Any]:
-        given = {modality: value for modality, value in images.items() if value is not None}
-        if not given:
+        if not (given := {modality: value for modality, value in images.items() if value is not None}):
             raise ValueError("no images given: give vision=..., touch=..., or both")
         for modality in given:
             self.check_modality(modality)
@@ -248,8 +247,7 @@ class Model(nn.Module):
             numbers = " and ".join(f"{len(features)} of {modality}" for modality, features in given.items())
             raise ValueError(f"{numbers} are no pairs: give as many images of each, or one modality")
         asked = "both" if len(given) == 2 else next(iter(given))
-        chosen = [r for r in self.probes.values() if r.info.modality == asked]
-        if not chosen:
+        if not (chosen := [r for r in self.probes.values() if r.info.modality == asked]):
             how = "load an artifact that `mvitac publish` wrote with labelled data"
             raise ValueError(f"this model has no probe on {asked}: {how}")
         return {r.info.task: r(torch.cat([given[m].cpu() for m in r.info.modalities], dim=1)) for r in chosen}

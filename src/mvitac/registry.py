@@ -127,8 +127,7 @@ def from_json(annotation: Any, value: Any, where: str = "run") -> Any:
 
 def _dataclass_from_json(cls: type, given: dict[str, Any], where: str) -> Any:
     if issubclass(cls, Registered):
-        name = given.pop("name", "")
-        if not isinstance(name, str):
+        if not isinstance(name := given.pop("name", ""), str):
             raise ValueError(f"{where}.name: expected one of {', '.join(cls.choices)}, got {name!r}")
         cls = find(cls, name)
     names, hints = sorted(field.name for field in dataclasses.fields(cls)), typing.get_type_hints(cls)  # type: ignore[arg-type]

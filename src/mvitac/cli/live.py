@@ -265,8 +265,7 @@ def sources(
     ``inputs``: modality -> shape [S, S, C] of an input. ValueError if only some have a source: none is simulated then.
     """
     given: dict[str, tuple[str, ...]] = {"vision": (vision,) if vision else (), "touch": tuple(touch)}
-    given = {modality: texts for modality, texts in given.items() if texts}
-    if not given:
+    if not (given := {modality: texts for modality, texts in given.items() if texts}):
         return {m: tuple(f"sim:{i}" for i in range(shape[2] // 3)) for m, shape in inputs.items()}
     for modality in inputs.keys() - given.keys():
         raise ValueError(f"the model takes {modality} too: give --{modality} SOURCE (sim for a simulated one)")

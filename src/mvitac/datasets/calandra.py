@@ -138,8 +138,7 @@ class Calandra(Source):
 
     def __init__(self, config: CalandraConfig) -> None:
         self.config = config
-        shards = sorted(file for file in config.path.glob("*.h5") if SHARD.fullmatch(file.name))
-        if not shards:
+        if not (shards := sorted(file for file in config.path.glob("*.h5") if SHARD.fullmatch(file.name))):
             raise ValueError(f"{config.path} has no calandra_corl2017_NNN.h5: download some (doi 10.25532/OPARA-700)")
         self._files = {file: one_stamp([stamp_of(str(file))]) for file in shards}
         everything = [grasp for file in self._files for grasp in list_grasps(file)]

@@ -192,8 +192,7 @@ def _check(root: Path, rows: Sequence[Row], episodes: dict[str, dict[str, Any]])
     number, frame, time = (_numbers(root, rows, name) for name in ("episode_index", "frame_index", "timestamp"))
     order = np.lexsort((frame, number))
     for name, values in (("frame_index", frame), ("timestamp", time)):
-        stands = (np.diff(values[order]) <= 0) & (np.diff(number[order]) == 0)
-        if stands.any():
+        if (stands := (np.diff(values[order]) <= 0) & (np.diff(number[order]) == 0)).any():
             row = rows[order[np.argmax(stands) + 1]]
             where = f"{root / 'data'}: episode {row['episode_index']}, frame {row['frame_index']}"
             raise ValueError(f"{where}: {name} {row[name]} does not rise: fetch it again")

@@ -55,8 +55,7 @@ class MixConfig(DatasetConfig):
         return found
 
     def _frames(self, quiet: bool) -> Pack:
-        given = self.named_parts()
-        if len(given) < 2:
+        if len(given := self.named_parts()) < 2:
             raise ValueError(f"a mix needs at least two parts, got {len(given)}: --data.parts a=packs/a b=packs/b")
         parts = {}
         for name, folder, _ in given:

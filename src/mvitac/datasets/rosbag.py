@@ -70,8 +70,7 @@ class RosbagConfig(RecordedConfig):
         dropped, same = 0, Counter[str]()
         for bag in bags:
             seen = _read(bag, cameras, [name for name in dict.fromkeys(named) if name])
-            own = seen[cameras[0]][0][::every]
-            if not len(own):
+            if not len(own := seen[cameras[0]][0][::every]):
                 raise ValueError(f"{bag} has no image of {cameras[0]}: is it complete?")
             good = np.ones(len(own), bool)
             cells: list[Row] = [{} for _ in own]

@@ -56,8 +56,7 @@ def _grasps(root: Path, file: Path) -> list[dict[str, str]]:
     rows: list[dict[str, str]] = []
     widths: dict[str, float] = {}
     for number, line in enumerate(file.read_text(encoding="utf-8-sig", errors="replace").splitlines(), 1):
-        words = line.split()
-        if not words:
+        if not (words := line.split()):
             continue
         good = len(words) == 8 and number_of(words[0]) is not None and words[5].isdecimal()
         if not good or words[2] not in ("0", "1") or "/" in words[6]:  # the folder, which is one of the object's

@@ -310,8 +310,7 @@ def check_unseen(
 
 def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[AnyTask], list[str]]:
     """The tasks and modalities that ``session`` asks for; ValueError if the data lacks one."""
-    known = {task.name: task for task in pack.spec.all_tasks}
-    if not known:
+    if not (known := {task.name: task for task in pack.spec.all_tasks}):
         what = f"dataset {pack.spec.name!r} has no labels and no values"
         raise ValueError(f"{what}: pack it with --labels or --values")
     check_known("task", session.tasks, known)

@@ -29,8 +29,7 @@ def cross_modal(model: Model, pack: Pack) -> list[dict[str, Any]]:
         return []
     rows = retrieved_rows(pack, "test")
     groups = torch.from_numpy(group_numbers(pack, rows))
-    sizes = np.bincount(groups.numpy())
-    if len(sizes) < MIN_GALLERY:
+    if len(sizes := np.bincount(groups.numpy())) < MIN_GALLERY:
         return []
     device, records = next(model.parameters()).device, []
     x = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in ("touch", "vision")}

@@ -125,8 +125,7 @@ def verdicts(task: dict[str, Any]) -> list[str]:
             continue
         said.append(f"{source} by {WORDS[modality]}: interval {above(own, controls)}")
         cells = {WORDS[m]: (task[m][source], task[m].get("imagenet")) for m in columns_of(task) if source in task[m]}
-        level = [m for m, (mine, frozen) in cells.items() if frozen and _low(mine) <= frozen["high"]]
-        if level:
+        if level := [m for m, (mine, frozen) in cells.items() if frozen and _low(mine) <= frozen["high"]]:
             said.append(f"{source}: not above a frozen ImageNet trunk beyond the intervals, by {', '.join(level)}")
     return said
 

@@ -140,8 +140,7 @@ def learn_looks(known: Pack, new: Pack, option: str) -> Looks:
     ValueError, which names ``option``, if there is not exactly one, or the colours of a sensor cannot be learned.
     """
     _check_gel(new, option)
-    names = [name for name in new.sensor_names if name not in known.sensor_names]
-    if len(names) != 1:
+    if len(names := [name for name in new.sensor_names if name not in known.sensor_names]) != 1:
         given = f"{len(names)} sensors ({listed(names)})" if names else f"no sensor but {listed(known.sensor_names)}"
         raise ValueError(f"{option}: {new.path} has {given}: give images of one that {known.path} lacks")
     number, most = new.sensor_names.index(names[0]), _most_used(known)

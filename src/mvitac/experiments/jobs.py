@@ -44,8 +44,7 @@ class Job:
     @property
     def failure(self) -> str:
         """Why the run diverged; "" if it did not."""
-        path = self.out / "failed.json"
-        with fields_of(path):
+        with fields_of(path := self.out / "failed.json"):
             return str(read_json(path, "a failure")["error"]) if path.exists() else ""
 
     @property

@@ -197,8 +197,7 @@ class MethodConfig(Registered, ABC):
 
     def check_complete(self, pack: Pack, rows: np.ndarray, modalities: tuple[str, ...]) -> None:
         for modality in modalities:
-            lacking = rows[~pack.has(modality)[rows]]
-            if len(lacking):
+            if len(lacking := rows[~pack.has(modality)[rows]]):
                 no = f"{len(lacking)} rows of part {', '.join(np.unique(pack.column('part')[lacking]))} have no {modality}"
                 needs = f"method {self.name!r} needs {' and '.join(modalities)} of every row"
                 raise ValueError(f"{needs}, but {no}: choose another --method")

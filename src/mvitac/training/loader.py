@@ -52,8 +52,7 @@ def prefetch_cuda(batches: Iterator[Views], device: torch.device) -> Iterator[Vi
     def on_side() -> Iterator[tuple[Views, Any]]:
         while True:
             with torch.cuda.device(device), torch.cuda.stream(side):
-                batch = next(batches, None)
-                if batch is None:
+                if (batch := next(batches, None)) is None:
                     return
                 yield batch, side.record_event()
 

@@ -178,8 +178,7 @@ def verdict(start: Cells, end: Cells, by: str) -> list[str]:
             word = "neither" if abs(points) <= margin else "rose" if points > 0 else "fell"
             text += f" [{points - margin:+.1f}, {points + margin:+.1f}]"
         said[word].append(text)
-    found = [f"{word}: {', '.join(texts)}" for word, texts in said.items() if texts]
-    if not found:
+    if not (found := [f"{word}: {', '.join(texts)}" for word, texts in said.items() if texts]):
         return ["split val has no labels of two classes, and no values, that were not trained on: no verdict"]
     return [f"compared with the start (linear probe, points of accuracy or R2 on {by}s of val), {found[0]}", *found[1:]]
 

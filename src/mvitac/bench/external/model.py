@@ -152,8 +152,7 @@ class ExternalModel(Model):
 
         The pack gets windows if an encoder wants several frames, the pack can order its frames, and it has no windows yet.
         """
-        modalities = tuple(m for m in self.parts if m in pack.spec.modalities)
-        if not modalities:
+        if not (modalities := tuple(m for m in self.parts if m in pack.spec.modalities)):
             known = f"{' and '.join(self.parts)}, {pack.spec.name!r} has {', '.join(pack.spec.modalities)}"
             raise ValueError(f"{self.text} reads {known}: give reads=touch, vision or both")
         notes: tuple[str, ...] = ()

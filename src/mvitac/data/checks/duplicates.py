@@ -20,8 +20,7 @@ def exact_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     notes, rows = [], []
     for name, one in looks.items():
         _, first, numbers = np.unique(one.exact, return_index=True, return_inverse=True)
-        across = np.flatnonzero(np.isin(numbers, numbers[sides != sides[first[numbers]]]) & one.seen)
-        if len(across):
+        if len(across := np.flatnonzero(np.isin(numbers, numbers[sides != sides[first[numbers]]]) & one.seen)):
             notes.append(f"{name}: {share(len(across), pack.num)} rows have a copy in another split")
             rows += across[np.argsort(numbers[across], kind="stable")].tolist()
     advice = "remove the copies, or put them in one group so that they stay in one split"

@@ -137,8 +137,7 @@ def _demonstrations(file: Path, datasets: dict[str, Any], images: Collection[str
         raise ValueError(f"{file} holds no datasets: is it the right file?")
     found = ((path, name) for path in datasets for name in images or USUAL if f"/{path}".endswith(f"/{name}"))
     shown = ((path, name) for path, name in found if images or _holds_images(datasets[path]))
-    groups = list(dict.fromkeys(path[: -len(name)].rstrip("/") for path, name in shown))
-    if not groups:
+    if not (groups := list(dict.fromkeys(path[: -len(name)].rstrip("/") for path, name in shown))):
         raise _no_images(file, images or USUAL[:2], _seen(datasets))
     for home, _, name in (group.rpartition("/") for group in groups):  # robomimic keeps each image twice
         if f"{home}/next_{name}".lstrip("/") in groups:

@@ -185,8 +185,7 @@ def joined(
     order = np.argsort(stamps, kind="stable")
     stamps = stamps[order]
     at, away = nearest(stamps, times)
-    good = away <= tolerance + SLACK
-    if not good.any():
+    if not (good := away <= tolerance + SLACK).any():
         return [{} for _ in times], 0.0
     gaps = np.diff(stamps)[np.diff(np.searchsorted(np.sort(times), stamps)) > 0]  # of those between recordings none
     columns = {name: [log.rows[row][name] for row in order[at]] for name in log.rows[0]}

@@ -115,8 +115,7 @@ def read_values(
         columns[target.name] = [math.nan] * len(counts)
         for i, (row, counted) in enumerate(zip(table.rows, counts, strict=True)):
             if counted and (cell := row[target.name]):
-                value = number_of(cell)
-                if value is None:
+                if (value := number_of(cell)) is None:
                     of = f"an element, such as {target.name}[0]" if cell[0] in "[(" else "a finite number, or nothing"
                     raise ValueError(f"{table.at(i)}: {target.name} is {cell!r}: give {of}")
                 columns[target.name][i] = value

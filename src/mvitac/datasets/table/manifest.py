@@ -99,16 +99,14 @@ class Manifest:
 
     def filtered(self, holds: Sequence[bool], why: str) -> "Manifest":
         """Return the rows for which ``holds``; ValueError says ``why`` there are none."""
-        rows = [i for i, kept in enumerate(holds) if kept]
-        if not rows:
+        if not (rows := [i for i, kept in enumerate(holds) if kept]):
             raise ValueError(f"{self.path}: {why}")
         images = {column: [refs[i] for i in rows] for column, refs in self.images.items()}
         return replace(self, rows=[self.rows[i] for i in rows], numbers=[self.numbers[i] for i in rows], images=images)
 
     def filled(self, column: str, what: str) -> list[str]:
         """Return the cells of ``column``; ValueError if one of them is empty."""
-        cells = [row[column] for row in self.rows]
-        if "" in cells:
+        if "" in (cells := [row[column] for row in self.rows]):
             raise ValueError(f"{self.at(cells.index(''))}: column {column!r} ({what}) is empty")
         return cells
 

@@ -133,8 +133,7 @@ def stratify(counts: np.ndarray, shares: tuple[float, ...], seed: int) -> np.nda
     number of groups its confidence interval. A class with a single group does not count. ``counts`` [G, C] is the
     number of rows of each group in each class. Returns int64 [G], the index in ``shares`` of each group's split.
     """
-    num = len(counts)
-    if not num:
+    if not (num := len(counts)):
         return np.zeros(0, np.int64)
     counts = counts[:, (counts > 0).sum(0) > 1].astype(np.float64)
     has = (counts > 0).astype(np.float64)
