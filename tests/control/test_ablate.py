@@ -159,6 +159,7 @@ def test_episodes_may_end_when_the_policy_is_done() -> None:
     found = ablate(lambda o: [o["touch"].mean()], own)
     rows = {row["kind"]: row for row in found["rows"]}
     assert found["error"][0] == 3 and rows["another episode"]["error"][0] == 0 == rows["10 frames ago"]["error"][0]
+    assert found["verdicts"]["touch"] == "Cannot tell whether the policy uses touch: 6 episodes are too few."
     assert rows["mean frame"]["error"][0] == 1 and rows["mean frame"]["change"][0] > 0  # four steps in each episode
     for loss, says in ((0.0, "episode 2 has no step"), (np.nan, "episode 2 has a loss of nan")):
         odd = Way(1)

@@ -32,7 +32,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.windows import places, recordings
 from mvitac.datasets.lerobot import FELT
 from mvitac.deploy.artifact import load
-from mvitac.evaluation.intervals import interval, mean_interval
+from mvitac.evaluation.intervals import interval, least_p, mean_interval
 from mvitac.registry import check_known
 from mvitac.system.files import brief
 from mvitac.system.progress import work
@@ -290,7 +290,9 @@ def ablate(policy: Policy, episodes: Episodes) -> dict[str, Any]:
         again, *_ = act(policy, episodes)  # last: what a policy keeps adds up
     if again.shape != normal.shape or away(again, normal, scale).max() > SAME:
         raise ValueError("the policy acts differently on the same episodes: give it reset(), and seed what it draws")
-    found = {sense: verdict(sense, [row for row in rows if row["sense"] == sense]) for sense in episodes.senses}
+    found = {
+        sense: verdict(sense, [row for row in rows if row["sense"] == sense], len(kept)) for sense in episodes.senses
+    }
     error = np.maximum(_paired(own, kept, level=True)[:3], 0).tolist()
     if episodes.unit == "failures":  # 0 or 1 of each episode
         error = list(interval([{"group_sizes": [1] * len(kept), "group_correct": [own[each[0]] for each in kept]}]))
@@ -318,8 +320,9 @@ def _paired(values: np.ndarray, episodes: Sequence[np.ndarray], *, level: bool =
     return list(mean_interval(np.array([[values[steps].mean() for steps in episodes if len(steps)]]), level=level))
 
 
-def verdict(sense: str, rows: Sequence[Mapping[str, Any]]) -> str:
-    """One sentence: whether the policy uses ``sense``. p is corrected for the number of plausible replacements."""
+def verdict(sense: str, rows: Sequence[Mapping[str, Any]], num: int) -> str:
+    """One sentence: whether the policy uses ``sense``. p is corrected for the number of plausible replacements. Of ``num``
+    episodes under seven no p is small enough."""
     for row in rows:
         mean, p = row["error"][0], row["error"][3] * len(PLAUSIBLE)
         if row["kind"] in PLAUSIBLE and mean > 0 and p < 0.05:
@@ -327,6 +330,8 @@ def verdict(sense: str, rows: Sequence[Mapping[str, Any]]) -> str:
             return f"The policy uses {sense}: its error grows {size}."
     if max(row["change"][2] for row in rows) < SMALL:
         return f"The policy does not use {sense}: no replacement changes its action by {SMALL} standard deviations."
+    if least_p(num) * len(PLAUSIBLE) >= 0.05:
+        return f"Cannot tell whether the policy uses {sense}: {num} episodes are too few."
     return f"Cannot tell whether the policy uses {sense}: its action changes, its error does not grow beyond chance."
 
 
