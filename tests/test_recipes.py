@@ -37,8 +37,7 @@ def test_paper_constants() -> None:
 
 def test_authors_constants() -> None:
     """https://github.com/ligerfotis/mvitac at commit a5b572d."""
-    run = recipe("authors", GraspsConfig())
-    method = run.method
+    method = (run := recipe("authors", GraspsConfig())).method
     assert isinstance(method, MViTacConfig)
     assert (method.momentum, method.lambda_inter, method.hidden, method.dropout) == (0.99, 1, 2048, 0.5)
     assert (run.optim.lr, run.optim.weight_decay, run.optim.eps, run.optim.schedule) == (1e-3, 1e-6, 1e-8, "late-step")

@@ -21,8 +21,7 @@ SIDE = 16
 
 
 def written(kind: str, folder: Path) -> Path:
-    rng = np.random.default_rng(5)
-    rgb = rng.integers(0, 256, (20, 24, 3), dtype=np.uint8)
+    rgb = (rng := np.random.default_rng(5)).integers(0, 256, (20, 24, 3), dtype=np.uint8)
     path = folder / "touch.png"
     if kind == "jpeg rotated by EXIF":
         path, exif = folder / "touch.jpg", Image.Exif()
@@ -49,8 +48,7 @@ def test_a_file_of_another_format_starts_no_program(tmp_path: Path, monkeypatch:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr("PIL.EpsImagePlugin.gs_binary", None)
     (tmp_path / "x.png").write_bytes(EPS)
-    live = Folder(tmp_path)
-    live.open()
+    (live := Folder(tmp_path)).open()
     for read in (lambda: decode(tmp_path / "x.png"), lambda: _picture([tmp_path / "x.png"]), live.read):
         with pytest.raises(ValueError, match=r"x\.png cannot be read as an image"):
             read()
@@ -83,8 +81,7 @@ def test_same_pixels_everywhere(kind: str, tmp_path: Path) -> None:
     (tmp_path / "pairs.csv").write_text(f"touch\n{path.name}\n")
     source = FolderConfig(path=tmp_path / "pairs.csv", size=SIDE).source()
     packed = build(source, tmp_path / "pack", size=SIDE, quiet=True).images["touch"][0]
-    live = Folder(tmp_path)
-    live.open()
+    (live := Folder(tmp_path)).open()
     with Image.open(path) as opened:
         before = opened.copy()
         embedded = to_array(opened, 3, "touch")
@@ -102,8 +99,7 @@ def test_a_damaged_jpeg_is_refused(tmp_path: Path, progressive: bool) -> None:
     """Where libjpeg warns, Pillow shows gray or smeared pixels. An end marker in a comment is none."""
     path, end = tmp_path / "touch.jpg", b"\xff\xd9"
     smooth((320, 240)).save(path, comment=end, quality=90, progressive=progressive)
-    whole = path.read_bytes()
-    middle = len(whole) // 2
+    middle = len(whole := path.read_bytes()) // 2
     damaged = {
         "cut off": whole[:middle],
         "zeros to the end": whole[:middle] + bytes(len(whole) - middle),

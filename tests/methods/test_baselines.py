@@ -97,8 +97,7 @@ def test_cmc_equals_a_direct_transcription(softmax: bool) -> None:
 
 
 def test_ssvtp_is_the_mean_of_both_directions() -> None:
-    method = build("ssvtp")
-    batch = views(method)
+    batch = views(method := build("ssvtp"))
     z = {m: tower(batch.images[m][0]).detach() for m, tower in method.towers.items()}  # type: ignore[union-attr]
     both = slow_info_nce(z["vision"], z["touch"], 0.07) + slow_info_nce(z["touch"], z["vision"], 0.07)
     assert float(outcome(method, batch)["loss"].detach()) == pytest.approx(both / 2, rel=1e-4)
@@ -148,16 +147,14 @@ def test_moco_contrasts_with_the_queue_then_fills_it() -> None:
 
 def test_queues_and_negatives_are_a_share_of_the_rows() -> None:
     """An eighth; and TAG's 16,384 for its 91,982 rows, or as many per row for fewer."""
-    method = MoCoConfig(hidden=8, out=4).build(Toy().spec(), TINY)
-    method.prepare(ROWS)
+    (method := MoCoConfig(hidden=8, out=4).build(Toy().spec(), TINY)).prepare(ROWS)
     assert all(len(queue.keys) == 10 for queue in method.queues.values())
     assert [MoCoConfig(queue=4096).queue_size(num) for num in (1, 12, 96, 1_281_167)] == [1, 1, 12, 4_096]
     assert [CMCConfig().negatives(num) for num in (3, 3_900, 91_982)] == [1, 702, 16_384]
 
 
 def test_mct_crosses_modalities_through_the_inter_heads() -> None:
-    method = build("mct")
-    batch = views(method)
+    batch = views(method := build("mct"))
     towers, queues = method, {n: q.keys.clone() for n, q in method.queues.items()}  # type: ignore[union-attr]
     query = {m: towers.query[m](v[0]) for m, v in batch.images.items()}
     key = {m: towers.key[m](v[1]) for m, v in batch.images.items()}
@@ -175,8 +172,7 @@ def distance(p: torch.Tensor, t: torch.Tensor) -> float:
 
 
 def test_byol_both_ways_round() -> None:
-    method = build("byol")
-    batch = views(method)
+    batch = views(method := build("byol"))
     found = outcome(method, batch)
     a, b = batch.images["touch"]
     online, predict, target = method.towers["touch"], method.predictor["touch"], method.target["touch"]  # type: ignore
@@ -259,8 +255,7 @@ def test_supervised_learns_the_labels_that_probes_are_fitted_on(pack: Pack, conf
 
 
 def test_calandra_has_a_trunk_per_stream() -> None:
-    method = CalandraConfig().build(Toy(touch_channels=6).spec(), TINY)
-    touch = method.encoders()["touch"]
+    touch = (method := CalandraConfig().build(Toy(touch_channels=6).spec(), TINY)).encoders()["touch"]
     assert len(touch.trunks) == 2 and touch.num_features == 128  # type: ignore[union-attr, arg-type]
     head = method.classifiers()["bright"]
     sizes = [(layer.in_features, layer.out_features) for layer in head if hasattr(layer, "in_features")]  # type: ignore

@@ -81,8 +81,7 @@ def test_forward_is_pure(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_encoders_and_projectors_fit(name: str) -> None:
-    method = build(name).eval()
-    batch = views(method)
+    batch = views(method := build(name).eval())
     features = {m: trunk(batch.images[m][0]) for m, trunk in method.encoders().items()}
     assert {m: z.shape for m, z in features.items()} == {"vision": (8, 64), "touch": (8, 64)}
     for modality, head in method.projectors().items():

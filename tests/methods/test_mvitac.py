@@ -21,8 +21,7 @@ def built(**changes: Any) -> Any:
 
 def test_equals_the_paper_written_out() -> None:
     """Eq. 4-14 with the paper's symbols, one embedding at a time, on copies of the same weights."""
-    method = built(lambda_inter=0.7, temperature=0.2)
-    batch = views(method)
+    batch = views(method := built(lambda_inter=0.7, temperature=0.2))
     with torch.no_grad():  # make keys differ from queries, or confusing them would go unseen
         for p in method.key.parameters():
             p.add_(0.05 * torch.randn_like(p))
@@ -80,8 +79,7 @@ def test_end_to_end_keys_are_the_queries_and_learn() -> None:
 
 def test_all_pairs_are_the_mean_over_four_pairs_of_views() -> None:
     """Inter-modal losses: both queries against both keys; intra-modal ones never pair a view with itself."""
-    method = built(keys="end-to-end", pairs="all")
-    batch = views(method)
+    batch = views(method := built(keys="end-to-end", pairs="all"))
     z = method.queries(batch) | method.keys(batch)
     losses, tau = method.contrast(z), CONFIG.temperature
     for part, (mine, other) in PARTS.items():
@@ -135,8 +133,7 @@ def test_settings_that_cannot_work_are_refused() -> None:
 
 
 def test_left_out_losses_are_told_but_not_minimised() -> None:
-    full = built()
-    batch = views(full)
+    batch = views(full := built())
     parts = full(batch)
     for losses in (("tt",), ("vv", "tv"), ("vt", "tv")):
         part = built(losses=losses, lambda_inter=0.5)(batch)
