@@ -81,8 +81,7 @@ def test_interrupted_build_resumes_to_the_same_bytes(
     with pytest.raises(KeyboardInterrupt), stop(writes_before_the_kill, KeyboardInterrupt()):
         build(Toy(), tmp_path / "p", **options)
     assert not (tmp_path / "p").exists()
-    source = Counting()
-    again = build(source, tmp_path / "p", **options)
+    again = build(source := Counting(), tmp_path / "p", **options)
     assert source.seen == list(range(writes_before_the_kill // 3 * 32, 120)), "what was done is not read again"
     if store == "jpeg":
         assert again.digest == build(Toy(), tmp_path / "straight", **options).digest
@@ -183,8 +182,7 @@ def test_what_lost_power_took_is_read_again(pack: Pack, tmp_path: Path, lost: st
         parts.write_bytes(lines[0] + lines[1].replace(b'"stamp": null', b'"stamp": "x"'))
     else:
         parts.unlink()
-    source = Counting()
-    build(source, tmp_path / "p", size=32, quiet=True)
+    build(source := Counting(), tmp_path / "p", size=32, quiet=True)
     assert source.seen == list(range(0 if lost == "list" else 32, 120))
     assert contents(tmp_path / "p") == contents(pack.path)
 
@@ -207,8 +205,7 @@ def test_killed_while_it_is_finished(pack: Pack, tmp_path: Path, monkeypatch: py
         for name in ("p", "q"):
             with pytest.raises(KeyboardInterrupt):
                 build(Stamped(damaged=(3, 40)), tmp_path / name, **options)
-    again = Stamped(damaged=(3, 40))
-    build(again, tmp_path / "p", **options)
+    build(again := Stamped(damaged=(3, 40)), tmp_path / "p", **options)
     assert not again.seen
     assert contents(tmp_path / "p") == contents(build(Toy(damaged=(3, 40)), tmp_path / "straight", **options).path)
     build(Stamped(changed=(3, 40)), tmp_path / "q", **options)  # repaired
@@ -228,8 +225,7 @@ def test_an_unfinished_pack_is_continued_by_its_own_data_and_no_leftovers_get_in
 
 def test_parts_are_made_again_from_the_first_whose_files_have_changed(pack: Pack, tmp_path: Path) -> None:
     partial = almost_finished(tmp_path / "p", Stamped())
-    source = Stamped(changed=(40, 119))
-    build(source, tmp_path / "p", size=32, quiet=True)
+    build(source := Stamped(changed=(40, 119)), tmp_path / "p", size=32, quiet=True)
     assert source.seen == list(range(32, 120)) and not partial.exists()
     assert contents(tmp_path / "p") == contents(pack.path), "no pack tells when its files were written"
 
@@ -251,8 +247,7 @@ def check_images(pack: Pack, items: list[int]) -> None:
     samples = [Toy().read(item)[0] for item in items]
     assert pack.column("id").tolist() == [sample.columns["id"] for sample in samples]
     for modality in ("vision", "touch"):
-        file = io.BytesIO()
-        np.save(file, np.stack([getattr(s, modality) for s in samples]))
+        np.save(file := io.BytesIO(), np.stack([getattr(s, modality) for s in samples]))
         assert (pack.path / f"{modality}.npy").read_bytes() == file.getvalue(), modality
     Pack(pack.path)  # the digests agree
 

@@ -65,8 +65,7 @@ def test_every_frame_is_the_one_it_says(path: Path) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_any_choice_of_frames_is_the_one_it_says(path: Path, seed: int) -> None:
-    rng = random.Random(seed)
-    wanted = rng.sample(range(NUM), rng.choice((1, 2, 7, 40)))
+    wanted = (rng := random.Random(seed)).sample(range(NUM), rng.choice((1, 2, 7, 40)))
     found = list(frames(path, wanted, 48))
     assert [number for number, _ in found] == sorted(wanted)
     for number, image in found:
@@ -136,8 +135,7 @@ def count(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
 
 
 def test_one_forward_pass_decodes_no_frame_twice_and_skips(made: dict[str, Path], count: dict[str, int]) -> None:
-    found = frames(made["mpeg4"], range(NUM))
-    next(found)
+    next(found := frames(made["mpeg4"], range(NUM)))
     assert count["packets"] <= 2  # each comes as it is decoded
     assert len(list(found)) == NUM - 1 and count == {"runs": 1, "packets": NUM}
     count.update(runs=0, packets=0)

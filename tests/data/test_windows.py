@@ -115,8 +115,7 @@ def test_a_window_trains_probes_and_reloads(presses: Pack, tmp_path: Path, tempo
     run = recipe("smoke", PackConfig(path=presses.path, num_frames=2))
     run = replace(run, steps=2, batch_size=8, eval_every=0, augment=Augment(size=16))
     run = replace(run, encoder=run.encoder.changed(temporal=temporal))
-    out = train(run, tmp_path / "run", quiet=True)
-    model = load(out)
+    model = load(out := train(run, tmp_path / "run", quiet=True))
     assert model.spec.frames("touch") == 2 and model.spec.frames("vision") == 1
     result = probe_runs([out], ProbeConfig(controls=False))
     assert {record["modality"] for record in result["records"]} == {"touch", "vision", "both"}

@@ -421,8 +421,7 @@ TRAPS: dict[str, tuple[Callable[[h5py.File], None], str]] = {
 
 @pytest.mark.parametrize("name", TRAPS)
 def test_files_that_show_others_or_fill_memory(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write(tmp_path / "a.h5", flat())
-    with h5py.File(path, "a") as file:
+    with h5py.File(path := write(tmp_path / "a.h5", flat()), "a") as file:
         TRAPS[name][0](file)
     refused(path, {"values": "pose[0]:mm"} if "numbers" in name else {}, TRAPS[name][1], capsys)
 
@@ -456,8 +455,7 @@ ZARR: dict[str, tuple[Callable[[Path], object], str]] = {
 
 @pytest.mark.parametrize("name", ZARR)
 def test_what_zarr_says_is_not_believed(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "a.zarr"
-    buffer = zarr.open_group(path, mode="w", zarr_format=2)
+    buffer = zarr.open_group(path := tmp_path / "a.zarr", mode="w", zarr_format=2)
     content = {"data/camera": grays(*range(20)), "data/gel": grays(*range(20)), ENDS: np.array([8, 20])}
     for dataset, value in content.items():
         buffer.create_array(dataset, data=value, chunks=value.shape)

@@ -288,8 +288,7 @@ def test_after_reaches_no_probe_unless_named_and_then_every_table_says_so(leakin
 
 
 def test_the_authors_protocol_is_named_too(leaking: Path, tmp_path: Path) -> None:
-    pack = leaking_pack(leaking, tmp_path / "p", ask=("during", "authors"))
-    task = pack.spec.tasks[1]
+    task = (pack := leaking_pack(leaking, tmp_path / "p", ask=("during", "authors"))).spec.tasks[1]
     rows = split_rows(pack, task)
     assert "after" in task.name and set(pack.column("phase")[rows.train]) == set(PHASES)
     assert set(pack.column("phase")[rows.val]) == set(pack.column("phase")[rows.test]) == {"during"}

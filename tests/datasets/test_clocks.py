@@ -93,8 +93,7 @@ def test_nothing_is_extrapolated_and_what_is_left_out_is_counted(tmp_path: Path)
     (note,) = pack.spec.notes
     said = rf"force\.csv joined by stamp, its largest gap is 0\.21 s; {150 - pack.num} of 150 rows are not .*"
     assert re.fullmatch(said, note)
-    wide = packed(root, tmp_path / "w", **LOG, tolerance=0.2)
-    time = wide.column("time").astype(float)
+    time = (wide := packed(root, tmp_path / "w", **LOG, tolerance=0.2)).column("time").astype(float)
     assert ((time > 0.893) & (time < 1.093)).sum() == 15
     assert np.allclose(wide.values(wide.spec.values[0])[:, 0], force(time), atol=1e-6)
 
@@ -165,8 +164,7 @@ def spoil(*rows: int, **cells: Callable[[str], str]) -> Callable[[Path], None]:
     """Change cells of the first recording's log in ``rows`` (from 1; default: all)."""
 
     def change(root: Path) -> None:
-        file = root / "0/force.csv"
-        with file.open(newline="") as stream:
+        with (file := root / "0/force.csv").open(newline="") as stream:
             lines = list(csv.DictReader(stream))
         for i, line in enumerate(lines, 1):
             line |= {name: made(line[name]) for name, made in cells.items() if i in (rows or (i,))}
@@ -358,8 +356,7 @@ def test_the_check_finds_shifts_of_real_grasps(tmp_path: Path) -> None:
             rows = pack.rows_of(number)
             by = rng.uniform(-0.5, 0.5) if shift == "own" else float(shift)
             late[rows] = np.interp(time[rows] - by, time[rows], force[rows], np.nan, np.nan)
-        moved = copy.copy(pack)
-        moved.__dict__.pop("_answers", None)  # kept values
+        (moved := copy.copy(pack)).__dict__.pop("_answers", None)  # kept values
         moved.table = pack.table.set_column(place, "force_n", pa.array(late))
         found = time_shift(moved, looks)
         size = re.search(r"values come ([\d.]+) rows .* (late|early)", found.evidence)

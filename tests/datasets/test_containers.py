@@ -27,8 +27,7 @@ def packed(config: RowsConfig, out: Path) -> Pack:
 
 
 def png(value: int, size: tuple[int, int] = (20, 16)) -> bytes:
-    buffer = io.BytesIO()
-    Image.new("RGB", size, (value, value, value)).save(buffer, "PNG")
+    Image.new("RGB", size, (value, value, value)).save(buffer := io.BytesIO(), "PNG")
     return buffer.getvalue()
 
 
@@ -71,8 +70,7 @@ def make_lerobot(root: Path, *, gel_rate: int = 10, version: str = "v3.0") -> Pa
             image = {"bytes": png(10 * e + i), "path": None}
             rows.append({FRONT: image, "timestamp": i / 10, "observation.state": [len(rows) / 4, 2.0], **row})
     for file, part in enumerate((rows[:12], rows[12:])):
-        path = root / f"data/chunk-000/file-{file:03d}.parquet"
-        path.parent.mkdir(parents=True, exist_ok=True)
+        (path := root / f"data/chunk-000/file-{file:03d}.parquet").parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(pa.Table.from_pylist(part), path, row_group_size=5)
     return root
 
@@ -147,8 +145,7 @@ def test_lerobot_beyond_the_tolerance(tmp_path: Path) -> None:
 
 
 def test_lerobot_takes_no_frame_of_another_episode(tmp_path: Path) -> None:
-    root = make_lerobot(tmp_path / "set")
-    file = root / "meta/episodes/chunk-000/file-000.parquet"
+    file = (root := make_lerobot(tmp_path / "set")) / "meta/episodes/chunk-000/file-000.parquet"
     episodes = pq.read_table(file).to_pylist()
     episodes[0][f"videos/{GEL}/to_timestamp"] = 1.1  # the frame at 1.1 s, which row 11 would want, is the next one's
     pq.write_table(pa.Table.from_pylist(episodes), file)

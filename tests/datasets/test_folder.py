@@ -130,8 +130,7 @@ def test_paths_are_relative_to_the_manifest_and_the_fingerprint_to_nothing(tmp_p
 
 
 def write_plain(folder: Path, level: int, when: int) -> FolderConfig:
-    names = [f"{i}.bmp" for i in range(40)]
-    for name in names:
+    for name in (names := [f"{i}.bmp" for i in range(40)]):
         os.utime(picture(folder / name, level), (when, when))
     rows = [{"touch": name, "split": "train" if i < 20 else "test"} for i, name in enumerate(names)]
     return FolderConfig(path=write(rows, folder / "manifest.csv"), size=16, workers=1)
@@ -146,8 +145,7 @@ def test_the_cache_knows_changed_files_of_the_same_size(tmp_path: Path) -> None:
 
 
 def test_a_repaired_image_has_another_stamp(tmp_path: Path) -> None:
-    config = write_plain(tmp_path / "set", 200, 10)
-    before = config.source().stamps()
+    before = (config := write_plain(tmp_path / "set", 200, 10)).source().stamps()
     os.utime(tmp_path / "set" / "35.bmp", (20, 20))
     assert np.flatnonzero(np.array(config.source().stamps()) != before).tolist() == [35]
 
@@ -234,8 +232,7 @@ def test_class_folders_pair_by_name(tmp_path: Path, kind: str) -> None:
         with pytest.raises(ValueError, match=r"\(vision/moss/5\.png\) has no touch path: .*allow-missing"):
             config.source()
         config = replace(config, allow_missing=True)
-    pack = packed(config, tmp_path / "pack")
-    seen = pack.images["vision"][:, 0, 0, 0]
+    seen = (pack := packed(config, tmp_path / "pack")).images["vision"][:, 0, 0, 0]
     assert pack.spec.tasks[0].classes == ("brick", "moss") and sorted(seen) == list(range(12))
     assert (pack.column("label_label") == seen % 2).all()
     if kind != "plain":
@@ -284,11 +281,9 @@ def test_sixteen_bits_are_scaled_not_clipped(tmp_path: Path) -> None:
 
 def test_gray_palette_bilevel_and_alpha_become_rgb(tmp_path: Path) -> None:
     rgb = Image.fromarray(np.random.default_rng(0).integers(0, 4, (12, 10, 3), np.uint8) * 80)
-    gray = rgb.convert("L")
-    gray.save(tmp_path / "gray.png")
+    (gray := rgb.convert("L")).save(tmp_path / "gray.png")
     assert (np.asarray(decode(tmp_path / "gray.png")) == np.asarray(gray)[..., None]).all()
-    palette = rgb.quantize(256)
-    palette.save(tmp_path / "palette.png")
+    (palette := rgb.quantize(256)).save(tmp_path / "palette.png")
     assert decode(tmp_path / "palette.png") == palette.convert("RGB")
     gray.point(lambda v: 255 * (v > 99)).convert("1").save(tmp_path / "bits.png")
     assert set(np.unique(decode(tmp_path / "bits.png"))) == {0, 255}
@@ -552,8 +547,7 @@ def test_commands_say_what_a_group_is(tmp_path: Path, rows: Table, capsys: pytes
         if packed_now:
             assert main(["data", "info", str(tmp_path / "forgotten")]) == 0
     assert main(["data", "info", str(tmp_path / "grouped"), "--json", "-"]) == 0
-    said = capsys.readouterr()
-    assert json.loads(said.out)["groups"] == 8 and "one per object" in said.err
+    assert json.loads((said := capsys.readouterr()).out)["groups"] == 8 and "one per object" in said.err
     named = write([{"camera": row["vision"], "label": row["material"]} for row in rows], tmp_path / "named.csv")
     for command, prefix in (("data pack", "--"), ("data check", "--"), ("pretrain", "--data.")):
         words = [*command.split(), "--data", "folder", f"{prefix}path", str(named)]

@@ -56,8 +56,7 @@ def make_slip_gsmini(root: Path) -> None:
                 shutil.copytree(folder, copy)
                 if k == 2 and slips:
                     (copy / "slip.txt").unlink()
-    lonely = base / "thing_9/exp_num_1/camera_2.avi"
-    lonely.parent.mkdir(parents=True)
+    (lonely := base / "thing_9/exp_num_1/camera_2.avi").parent.mkdir(parents=True)
     shutil.copy(folder / "camera_2.avi", lonely)
 
 

@@ -188,8 +188,7 @@ def test_depth_and_what_cannot_be(tmp_path: Path) -> None:
     ):
         with pytest.raises(ValueError, match=says):
             RosbagConfig(path=bag, **options).source()
-    file = bag / "bag.mcap"
-    whole = file.read_bytes()
+    whole = (file := bag / "bag.mcap").read_bytes()
     for harmed in (whole[:5000], whole.replace(GEL.encode(), b"\xff" * len(GEL))):  # cut, and no UTF-8
         file.write_bytes(harmed)
         with pytest.raises(ValueError, match=r"bag cannot be read as a bag \(.*\): is it complete"):

@@ -25,8 +25,7 @@ Table = list[dict[str, Any]]
 
 def table(file: Path, rows: Table) -> Path:
     with file.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]))
-        writer.writeheader()
+        (writer := csv.DictWriter(stream, list(rows[0]))).writeheader()
         writer.writerows(rows)
     return file
 
@@ -124,8 +123,7 @@ def test_a_split_that_cuts_a_video_is_refused_and_seen_by_the_doctor(films: Path
     ],
 )
 def test_bad_frames_are_named(films: Path, tmp_path: Path, cells: dict[str, Any], says: str) -> None:
-    rows = film_rows()
-    rows[1].update(cells)
+    (rows := film_rows())[1].update(cells)
     with pytest.raises(ValueError, match=says) as caught:
         packed(table(films / "bad.csv", rows), tmp_path / "pack", labels=("label",), group="take", split="by-group")
     assert "\n" not in str(caught.value)

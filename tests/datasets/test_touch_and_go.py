@@ -288,8 +288,7 @@ def test_missing_recordings_are_named_and_may_be_left_out(tree: Path, tmp_path: 
 
 
 def test_a_damaged_stretch_is_left_out_and_listed(tree: Path, tmp_path: Path) -> None:
-    root = shutil.copytree(tree, tmp_path / "tree")
-    path = root / "dataset" / NAMES[2] / "gelsight.mp4"
+    path = (root := shutil.copytree(tree, tmp_path / "tree")) / "dataset" / NAMES[2] / "gelsight.mp4"
     with av.open(str(path)) as container:
         at, size = next((p.pos, p.size) for i, p in enumerate(container.demux(video=0)) if i == 134)
     whole = bytearray(path.read_bytes())
@@ -305,8 +304,7 @@ def test_a_damaged_stretch_is_left_out_and_listed(tree: Path, tmp_path: Path) ->
 
 
 def test_jpegs_that_are_missing_or_cut_are_listed(tmp_path: Path) -> None:
-    root = write_tree(tmp_path / "tree", jpegs=True)
-    folder = root / "dataset" / NAMES[0] / "video_frame"
+    folder = (root := write_tree(tmp_path / "tree", jpegs=True)) / "dataset" / NAMES[0] / "video_frame"
     (folder / "0000000021.jpg").unlink()
     (folder / "0000000025.jpg").write_bytes((folder / "0000000025.jpg").read_bytes()[:300])
     pack = packed(root, tmp_path / "pack", max_damaged=0.05)
