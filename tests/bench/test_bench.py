@@ -119,8 +119,7 @@ def said(capsys: pytest.CaptureFixture[str], *words: object) -> str:
 
 
 def test_scores_are_those_of_probe(results: list[Path], smoke_run: Path, root: Path) -> None:
-    value = read_result(results[0])
-    block = value["blocks"][0]
+    block = (value := read_result(results[0]))["blocks"][0]
     found = {(r["source"], r["modality"], r["probe"]): r for r in records_of(block, value["encoder"])}
     asked = ProbeConfig(tasks=("pattern", "light"), modalities=("touch", "both"))
     expected = probe_runs([smoke_run], asked, Pack(root / "stripes"), allow_leak=True)["records"]
@@ -575,8 +574,7 @@ def test_results_of_other_suites_are_refused(
 
 
 def test_encoders_are_refused(smoke_run: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    model = load(smoke_run)
-    run, spec = model.run, model.spec
+    run, spec = (model := load(smoke_run)).run, model.spec
     bench = "--suite", root / "toys.toml", "--data-root", root, "--out", tmp_path / "out"
     broken = shutil.copytree(smoke_run, tmp_path / "nan")
     with torch.no_grad():

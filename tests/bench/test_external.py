@@ -174,8 +174,7 @@ def functions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 def test_python_functions(pack: Pack, functions: str) -> None:
     images = torch.from_numpy(pack.images["touch"][ROWS]).permute(0, 3, 1, 2)
-    net = open_model(f"{functions}good").on(pack)[0]
-    about = net.describe()["encoders"]["touch"]
+    about = (net := open_model(f"{functions}good").on(pack)[0]).describe()["encoders"]["touch"]
     assert (about["title"], about["licence"], about["features"], about["trained_on"]) == ("net", "MIT", 5, "ours")
     expected = net.parts["touch"].network.network(net.parts["touch"].preprocessing(images[:, None])).mean((2, 3))
     torch.testing.assert_close(net.features("touch", images), expected)

@@ -130,8 +130,7 @@ def test_a_result_that_no_episodes_give_is_refused(small: Insert) -> None:
 
 def test_regression_finds_what_pictures_show(small: Insert) -> None:
     """From images that are the answer itself, the clone is the expert; shuffled touch takes its half of it away."""
-    few = replace(small, episodes=4, demonstrations=(6,))
-    images, actions = few.shown
+    images, actions = (few := replace(small, episodes=4, demonstrations=(6,))).shown
     known = {images[sense][row].tobytes(): actions[row] for sense in images for row in range(len(actions))}
 
     def oracle(modality: str, pictures: np.ndarray) -> np.ndarray:

@@ -84,8 +84,7 @@ def test_true_pose_stays_on_and_no_touch_does_not(kind: str) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_contact_is_lost_beyond_the_limit_and_stays_lost(kind: str) -> None:
     for part in (0.8, 1.3):
-        episode = begin(kind, 1)
-        limit = episode.task.limit
+        limit = (episode := begin(kind, 1)).task.limit
         episode.step(episode.task.target + part * limit * (np.arange(len(limit)) == 0) - episode.poses[-1])
         there, mm, deg = episode.states[-1], *episode.error
         assert episode.lost == (part > 1) and (mm == limit[0]) == (part > 1)
@@ -127,8 +126,7 @@ def test_a_result_repeats(done: Path, small: Servo, tmp_path: Path, capsys: pyte
         result.run_suite([RANDOM.format(6)], small, tmp_path, About(name="five"))
     assert main(["bench", "check", str(done)]) == 0
     assert main(["bench", "board", str(done), "--out", str(tmp_path / "board.html")]) == 0
-    text = (tmp_path / "board.html").read_text()
-    assert "true pose" in text and "data:image/webp;base64," in text
+    assert "true pose" in (text := (tmp_path / "board.html").read_text()) and "data:image/webp;base64," in text
     assert f"{len(value['rows'])} rows hold" in capsys.readouterr().out
 
 
@@ -180,8 +178,7 @@ CHANGES: dict[str, Callable[[dict[str, Any]], Any]] = {
 def test_changed_results_are_refused(done: Path, tmp_path: Path, why: str) -> None:
     value = json.loads(done.read_text())
     CHANGES[why](value)
-    path = tmp_path / "changed.json"
-    path.write_text(json.dumps(value))
+    (path := tmp_path / "changed.json").write_text(json.dumps(value))
     with pytest.raises(ValueError, match=r"does not match its digest|this version reads 1"):
         result.read_control(path)
     value["digest"] = digest({key: part for key, part in value.items() if key not in VOLATILE})

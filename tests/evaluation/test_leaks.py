@@ -220,8 +220,7 @@ def test_equal_checksums_by_chance_are_no_leak(pack: Pack) -> None:
     """Of 100,000 and 100,000 different images, two or three have the same CRC-32."""
     rows, sums = pack.rows("train"), image_sums(pack)
     one = sums[rows[:1], 1]  # of touch
-    some = known_images(pack, rows, one)
-    assert some.sum() == 1 and some[0, 1]
+    assert (some := known_images(pack, rows, one)).sum() == 1 and some[0, 1]
     assert not known_images(pack, rows, np.concatenate([one, (1 << 33) + np.arange(1 << 18, dtype=np.uint64)])).any()
 
 

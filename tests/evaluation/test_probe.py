@@ -66,8 +66,7 @@ def features_that_know(pack: Pack, how_well: float = 3.0) -> np.ndarray:
 
 def test_the_papers_probe_learns_and_repeats() -> None:
     """60 epochs of 8 Adam steps at 1e-4 move a weight by at most .05: a hundred agreeing features make that decide."""
-    rng = np.random.default_rng(0)
-    y = rng.integers(0, 3, 2048)
+    y = (rng := np.random.default_rng(0)).integers(0, 3, 2048)
     x = (10 * np.repeat(np.eye(3)[y], 100, axis=1) + rng.normal(0, 5, (2048, 300))).astype(np.float32)
     assert (fit_papers(x, [y], [3], seed=0)[0](x).argmax(1) == y).mean() > 0.9
     first, same, other = (fit_papers(x[:256], [y[:256]], [3], seed=seed)[0](x) for seed in (0, 0, 1))
@@ -162,8 +161,7 @@ def test_damaged_cached_features_are_computed_again(
     model, rows = load(smoke_run), np.arange(20)
     first = features_module.features(model, pack, "touch", rows)
     (file,) = tmp_path.rglob("*.npy")
-    whole = file.read_bytes()
-    bit = bytearray(whole)
+    bit = bytearray(whole := file.read_bytes())
     bit[len(bit) // 2] ^= 1
     file.write_bytes({"bit": bytes(bit), "cut": whole[:500], "no digest": whole[:-32]}[damage])
     np.testing.assert_array_equal(features_module.features(model, pack, "touch", rows), first)
@@ -332,8 +330,7 @@ def test_a_control_of_values_sees_as_few_labels(measured: Pack) -> None:
 def test_the_command_shows_few_labels(smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = ["--tasks", "pattern", "--modalities", "touch", "--json", str(tmp_path / "scores.json")]
     assert main(["probe", str(smoke_run), *asked, "--fractions", "10", "50"]) == 0
-    said = capsys.readouterr().out
-    assert "(10 % of labels;" in said and "(50 % of labels;" in said
+    assert "(10 % of labels;" in (said := capsys.readouterr().out) and "(50 % of labels;" in said
     records = {(r["source"], r["probe"]): r for r in read_json(tmp_path / "scores.json", "")["records"]}
     for source in ("mvitac", "untrained"):
         sizes = {str(records[source, kind]["group_sizes"]) for kind in ("linear", "10 % of labels", "50 % of labels")}

@@ -30,8 +30,7 @@ POSE = (Target(name="z_mm", unit="mm"), Target(name="tilt_deg", unit="deg"))
 
 
 def drawn(num: int = 300, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    y = rng.normal(3, 2, (num, 2))
+    y = (rng := np.random.default_rng(seed)).normal(3, 2, (num, 2))
     return y, y + rng.normal(0, (0.5, 1.5), (num, 2)), rng.integers(0, 12, num)
 
 
@@ -112,8 +111,7 @@ def test_ridge_finds_a_linear_relation_in_any_unit_and_skips_what_was_not_measur
 
 
 def test_alpha_is_chosen_on_the_held_out_rows_by_squared_error() -> None:
-    rng = np.random.default_rng(0)
-    x = rng.normal(size=(80, 60))
+    x = (rng := np.random.default_rng(0)).normal(size=(80, 60))
     y = x[:, :1] + rng.normal(0, 3, (80, 1))  # noise: weak regularisation overfits
     memorised = np.concatenate([x[:60], x[:20]]), np.concatenate([y[:60], y[:20]])  # held out rows that were learned
     assert fit_ridge(x, y, 20)[1][0] > fit_ridge(*memorised, 20)[1][0]
@@ -123,8 +121,7 @@ def test_alpha_is_chosen_on_the_held_out_rows_by_squared_error() -> None:
 
 
 def test_a_feature_that_one_row_has_does_not_predict_metres() -> None:
-    rng = np.random.default_rng(0)
-    x = rng.normal(size=(1100, 3))
+    x = (rng := np.random.default_rng(0)).normal(size=(1100, 3))
     y = x[:, :1] + rng.normal(0, 0.1, (1100, 1))
     dead = np.zeros((1100, 1))
     dead[7], dead[1000] = 1e-6, 0.02  # after a ReLU: hardly there in one row of train, an ordinary value in one of test

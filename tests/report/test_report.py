@@ -277,8 +277,7 @@ def test_only_a_complete_result_of_the_same_weights_is_used_again(
     materials: Path, result: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs, pack = [materials / "run0", materials / "run1"], Pack(materials / "pack")
-    file = runs[0] / "probe.json"
-    write_json(file, result)
+    write_json(file := runs[0] / "probe.json", result)
     assert stored_result(runs, pack) == result
     assert stored_result(runs[::-1], pack) == result and stored_result(runs[:1], pack) is None
     asked = result["asked"]

@@ -49,8 +49,7 @@ def scored(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Pack, dict[s
 
 
 def said(result: dict[str, Any], probe: str = "linear") -> str:
-    file = io.StringIO()
-    print_summary(result, file, probe=probe)
+    print_summary(result, file := io.StringIO(), probe=probe)
     return file.getvalue()
 
 
@@ -109,8 +108,7 @@ def test_the_report_shows_values(scored: tuple[Path, Pack, dict[str, Any]], tmp_
 
 def test_one_test_group_of_values_alone(tmp_path: Path) -> None:
     run, _, result = scored_run(tmp_path, altered(Toy(values=True, vision_channels=0, num=48), one_tested, tasks=()))
-    stored = read_json(run / "probe.json", "scores")
-    cell = stored["summary"]["both"]["touch"]["pixels"]
+    cell = (stored := read_json(run / "probe.json", "scores"))["summary"]["both"]["touch"]["pixels"]
     assert cell["low"] is None and cell["groups"] == 1 and cell["targets"][0]["low"] is None and stored == result
     (run / "probe.json").unlink()  # the report probes values by itself
     text = f"{100 * cell['mean']:.1f}"
