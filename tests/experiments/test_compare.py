@@ -48,10 +48,8 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 @pytest.fixture(scope="module")
 def done(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     out = tmp_path_factory.mktemp("compare") / "out"
-    work = lay_out(small(pack), pack, out, ProbeConfig())
-    do_all(work, quiet=True)
-    result = gather(work, out, ProbeConfig())
-    write_tables(result, out)
+    do_all(work := lay_out(small(pack), pack, out, ProbeConfig()), quiet=True)
+    write_tables(result := gather(work, out, ProbeConfig()), out)
     return out, result
 
 
@@ -80,8 +78,7 @@ def test_table1_has_one_budget_and_ablation_leaves_out_what_changes_nothing(pack
     assert "grayscale .2" not in work.left_out
     assert "touch flips" in work.left_out  # these are the recipe's
     assert "'pack' has no data.difference" in work.left_out["difference images of touch"]
-    digests = [job.run.digest() for job in work.jobs]
-    assert len(set(digests)) == len(digests)
+    assert len(set(digests := [job.run.digest() for job in work.jobs])) == len(digests)
     with pytest.raises(ValueError, match="'pattern' has no labelled rows in split test: nothing to probe"):
         lay_out(small(pack), with_columns(pack, split=["train"] * pack.num), tmp_path, ProbeConfig())
     with pytest.raises(ValueError, match="batch_size is 999: give --set batch_size=72 or less"):
@@ -164,8 +161,7 @@ def test_scores_that_were_copied_from_another_run_are_computed_again(
 
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.toml")), ids=lambda file: file.stem)
 def test_plans_of_the_examples_name_settings_that_exist(file: Path) -> None:
-    plan = find_plan(str(file))
-    for row in plan.rows:
+    for row in (plan := find_plan(str(file))).rows:
         if not any(name.startswith("data.") for name in row.set):
             plan.run(row, PackConfig(), 0, phased=False)
 
@@ -300,8 +296,7 @@ def test_finished_runs_are_not_done_again(done: tuple[Path, dict], pack: Pack, m
     assert len(list(out.rglob("model.safetensors"))) == 6 and not list(out.rglob("checkpoint.pt"))
     monkeypatch.setattr(jobs, "train", None)  # calling it would raise
     monkeypatch.setattr(collect, "controls_of", None)
-    work = lay_out(small(pack), pack, out, ProbeConfig())
-    do_all(work, quiet=True)
+    do_all(work := lay_out(small(pack), pack, out, ProbeConfig()), quiet=True)
     assert gather(work, out, ProbeConfig()) == json.loads(json.dumps(result))
 
 
@@ -392,8 +387,7 @@ def test_other_settings_in_the_same_folder_are_refused(done: tuple[Path, dict], 
 def test_other_probes_score_finished_runs_again(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first, second = (ProbeConfig(controls=False, probes=probes) for probes in (("linear",), ("knn", "linear")))
     plan = small(pack, rows=ROWS[:1], seeds=1)
-    work = lay_out(plan, pack, tmp_path, first)
-    do_all(work, quiet=True)
+    do_all(work := lay_out(plan, pack, tmp_path, first), quiet=True)
     linear = gather(work, tmp_path, first)["records"]
     monkeypatch.setattr(Step, "__call__", None)  # nothing is trained again
     work = lay_out(plan, pack, tmp_path, second)

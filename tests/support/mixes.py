@@ -38,8 +38,7 @@ class Gel(Slice):
     prefix: str = "gel "
 
     def spec(self) -> DataSpec:
-        spec = super().spec()
-        pattern, bright = spec.tasks
+        pattern, bright = (spec := super().spec()).tasks
         pattern = replace(pattern, classes=("checks", "columns", "rows"))
         return replace(spec, name="gel", tasks=(pattern, replace(bright, classes=("dim", "bright"))), controls={})
 

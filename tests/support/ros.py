@@ -23,7 +23,6 @@ def raw(time: float, pixels: np.ndarray, encoding: str) -> Any:
 
 
 def compressed(time: float, pixels: np.ndarray) -> Any:
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, "PNG")
+    Image.fromarray(pixels).save(buffer := io.BytesIO(), "PNG")
     data = np.frombuffer(buffer.getvalue(), np.uint8)
     return STORE.types["sensor_msgs/msg/CompressedImage"](header=stamped(time), format="png", data=data)

@@ -73,8 +73,7 @@ def test_stopped_and_resumed_equals_straight(parts: dict[str, str], tmp_path: Pa
 
 
 def test_views_are_of_the_rows_that_have_the_modality(parts: dict[str, str]) -> None:
-    run = mix_run(parts["a"], parts["gel"], positives="same-touch")
-    pack = run.data.open()
+    pack = (run := mix_run(parts["a"], parts["gel"], positives="same-touch")).data.open()
     rows = np.array([*pack.rows("train")[[2, 0]], *pack.rows("train")[-3:], pack.rows("train")[4]])
     made = views_by(ImageLoader, run, pack, rows)
     assert {m: [len(view) for view in found] for m, found in made.images.items()} == {"vision": [3, 3], "touch": [6, 6]}
@@ -96,8 +95,7 @@ def ragged(method: Any, vision: int = 5, touch: int = 8) -> Views:
 @pytest.mark.parametrize("name", MISSING)
 def test_a_loss_is_of_the_rows_that_have_its_modality(name: str) -> None:
     """Each intra-modal loss equals that of a batch of these rows alone, and so do the methods' updates."""
-    method = build(name)
-    batch = ragged(method)
+    batch = ragged(method := build(name))
     losses = method(batch)
     assert losses["loss"].isfinite()
     losses["loss"].backward()
@@ -140,8 +138,7 @@ def test_a_method_that_needs_whole_pairs_names_the_rows(parts: dict[str, str], n
 
 
 def test_rows_without_a_loss_are_not_drawn_and_those_with_one_are(parts: dict[str, str], tmp_path: Path) -> None:
-    run = mix_run(parts["a"], parts["gel"])
-    pack = run.data.open()
+    pack = (run := mix_run(parts["a"], parts["gel"])).data.open()
     assert isinstance(pack, MixedPack)
     for losses, num in ((("vv",), 1), (("tt",), 2), (("vt", "tv"), 1), (("vv", "tt"), 2)):
         assert set(pack.part_of[MViTacConfig(losses=losses).training_rows(pack)]) == set(range(num))

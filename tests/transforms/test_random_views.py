@@ -56,8 +56,7 @@ def test_the_plain_view_is_the_normalised_image_and_a_flip_is_exact() -> None:
 
 def test_statistics_of_the_paper() -> None:
     """Area uniform in .2-1 (where the crop fits), ratio within 3/4-4/3, flips .5, grayscale .2."""
-    drawn = draw(ViewAugment(), 20000, 256, generator())
-    top, left, height, width = drawn.boxes.T
+    top, left, height, width = (drawn := draw(ViewAugment(), 20000, 256, generator())).boxes.T
     assert (top >= 0).all() and (left >= 0).all() and (top + height <= 256).all() and (left + width <= 256).all()
     area, ratio = height * width / 256**2, width / height
     assert 0.19 < float(area.min()) < 0.22 and 0.95 < float(area.max()) <= 1
