@@ -29,8 +29,10 @@ from mvitac.data.pack import Pack
 from mvitac.data.read_samples import read_parts
 from mvitac.data.source import Lost, Sample, Source
 from mvitac.datasets.pack import ON_VAL, PackConfig
+from mvitac.datasets.table.manifest import read_manifest
 from mvitac.evaluation.retrieval import retrieved_rows
 from mvitac.system import locks
+from mvitac.system.files import cache_dir
 from support.toy import Counting, Toy, threads_of, toy_pack, with_columns
 
 FILES = ("pack.json", "samples.parquet", "vision.npy", "touch.npy")
@@ -38,6 +40,16 @@ FILES = ("pack.json", "samples.parquet", "vision.npy", "touch.npy")
 
 def contents(path: Path) -> dict[str, bytes]:
     return {name: (path / name).read_bytes() for name in FILES}
+
+
+def test_a_folder_that_is_called_as_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """pyarrow takes a relative ~ for it. In MVITAC_CACHE, which no shell may have read, it is."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert toy_pack(Path("~/pack")).table == Pack("~/pack").table and (tmp_path / "~/pack").exists()
+    assert len(read_manifest(Path("~/pack/samples.parquet")).rows) == 120
+    monkeypatch.setenv("MVITAC_CACHE", "~/kept")
+    assert cache_dir() == tmp_path / "home/kept"
 
 
 @pytest.mark.parametrize("store", ["raw", "jpeg"])

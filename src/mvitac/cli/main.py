@@ -173,7 +173,7 @@ def _names(place: Path) -> str:
     place = place / "run.json" if (place / "run.json").is_file() else place
     if place.suffix in (".csv", ".jsonl", ".json") and place.is_file():
         return place.read_text(errors="replace")
-    if place.suffix == ".parquet" and place.is_file():
+    if place.suffix == ".parquet" and (place := place.absolute()).is_file():
         import pyarrow.parquet as pq
 
         with suppress(ValueError, OSError):  # a damaged file, of which the command itself says so

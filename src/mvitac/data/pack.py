@@ -68,7 +68,7 @@ class Pack:
         self._check_digest("samples.parquet")
         table = self._file("samples.parquet")
         try:
-            self.table: pa.Table = pq.read_table(table)
+            self.table: pa.Table = pq.read_table(table.absolute())  # pyarrow expands ~
             if len(self.table) != self.num:
                 raise ValueError(f"it has {len(self.table)} rows, pack.json promises {self.num}")
             check_table(self.table, self.spec)

@@ -229,7 +229,7 @@ def _rows(path: Path, begins: tuple[str, ...] = ("",)) -> list[dict[str, Any]]:
             raise ValueError(f"{path} cannot be read ({brief(error)}): fetch it again") from None
     try:
         check_ordinary(path)
-        table = pq.read_table(path)
+        table = pq.read_table(path.absolute())
     except (pa.ArrowException, OSError) as error:
         raise ValueError(f"{path} cannot be read ({brief(error)}): fetch the whole dataset") from None
     return table.select([name for name in table.column_names if name.startswith(begins)]).to_pylist()

@@ -52,7 +52,7 @@ class Embeddings:
         """``weights``: digest of the model that embeds the queries. ValueError if another one embedded the rows."""
         self.file = file
         try:
-            self.table: pa.Table = pq.read_table(file, page_checksum_verification=True)
+            self.table: pa.Table = pq.read_table(file.absolute(), page_checksum_verification=True)
             about = json.loads((self.table.schema.metadata or {}).get(ABOUT, b""))
         except (pa.ArrowException, OSError, ValueError) as error:
             raise ValueError(f"{file} is no table of mvitac embed: {brief(error)}") from None

@@ -188,5 +188,5 @@ def digest_file(path: Path) -> str:
 def cache_dir() -> Path:
     """Return the cache of packs and features: $MVITAC_CACHE, else $XDG_CACHE_HOME/mvitac, else ~/.cache/mvitac."""
     if "MVITAC_CACHE" in os.environ:
-        return Path(os.environ["MVITAC_CACHE"])
+        return Path(os.environ["MVITAC_CACHE"]).expanduser()
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "mvitac"

@@ -114,7 +114,9 @@ class ParquetCell(ImageRef):
     @contextmanager
     def opened(self) -> Iterator[pa.ChunkedArray]:
         try:
-            values = pq.ParquetFile(self.path).read_row_group(self.group, columns=[self.column]).column(0)
+            values = (
+                pq.ParquetFile(Path(self.path).absolute()).read_row_group(self.group, columns=[self.column]).column(0)
+            )
         except (pa.ArrowException, OSError) as error:
             raise ValueError(f"{self.path} cannot be read ({brief(error)})") from None
         yield values

@@ -204,7 +204,7 @@ def _read_csv(file: Path) -> list[dict[str, Any]]:
 
 
 def _read_parquet(file: Path) -> list[dict[str, Any]]:
-    table = pq.ParquetFile(file).read()
+    table = pq.ParquetFile(file.absolute()).read()
     return listed(table.select(table.column_names))  # KeyError for two columns of one name
 
 

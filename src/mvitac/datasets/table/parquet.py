@@ -50,7 +50,7 @@ def add_file(
     """
     try:
         check_ordinary(file)  # a pipe never ends
-        opened = pq.ParquetFile(file)
+        opened = pq.ParquetFile(file.absolute())
         schema, classes = opened.schema_arrow, _classes(opened.schema_arrow)
         images = [field.name for field in schema if _is_image(field.type)]
         flat = [field.name for field in schema if not pa.types.is_nested(field.type) or field.name in vectors]
