@@ -269,7 +269,8 @@ def test_film_and_learned_policy(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 
 def test_command(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (file := tmp_path / "mine.py").write_text("def policy(o):\n    return [o['touch'].mean() - 60, o['step']]\n")
+    file = tmp_path / "mine.py"
+    file.write_text("def policy(o):\n    return [o['touch'].mean() - 60, o['step']]\n")
     assert main(["ablate", f"{file}:policy", "--data", str(pack.path), "--json", str(tmp_path / "a.json")]) == 0
     printed = capsys.readouterr().out
     assert "The policy uses touch" in printed and re.search(r"\+0\.00 +\+0\.00 *\n", printed)  # of the camera

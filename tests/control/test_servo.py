@@ -178,7 +178,8 @@ CHANGES: dict[str, Callable[[dict[str, Any]], Any]] = {
 def test_changed_results_are_refused(done: Path, tmp_path: Path, why: str) -> None:
     value = json.loads(done.read_text())
     CHANGES[why](value)
-    (path := tmp_path / "changed.json").write_text(json.dumps(value))
+    path = tmp_path / "changed.json"
+    path.write_text(json.dumps(value))
     with pytest.raises(ValueError, match=r"does not match its digest|this version reads 1"):
         result.read_control(path)
     value["digest"] = digest({key: part for key, part in value.items() if key not in VOLATILE})

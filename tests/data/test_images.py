@@ -48,7 +48,8 @@ def test_a_file_of_another_format_starts_no_program(tmp_path: Path, monkeypatch:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr("PIL.EpsImagePlugin.gs_binary", None)
     (tmp_path / "x.png").write_bytes(EPS)
-    (live := Folder(tmp_path)).open()
+    live = Folder(tmp_path)
+    live.open()
     for read in (lambda: decode(tmp_path / "x.png"), lambda: _picture([tmp_path / "x.png"]), live.read):
         with pytest.raises(ValueError, match=r"x\.png cannot be read as an image"):
             read()
@@ -81,7 +82,8 @@ def test_same_pixels_everywhere(kind: str, tmp_path: Path) -> None:
     (tmp_path / "pairs.csv").write_text(f"touch\n{path.name}\n")
     source = FolderConfig(path=tmp_path / "pairs.csv", size=SIDE).source()
     packed = build(source, tmp_path / "pack", size=SIDE, quiet=True).images["touch"][0]
-    (live := Folder(tmp_path)).open()
+    live = Folder(tmp_path)
+    live.open()
     with Image.open(path) as opened:
         before = opened.copy()
         embedded = to_array(opened, 3, "touch")

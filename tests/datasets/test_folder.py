@@ -281,9 +281,11 @@ def test_sixteen_bits_are_scaled_not_clipped(tmp_path: Path) -> None:
 
 def test_gray_palette_bilevel_and_alpha_become_rgb(tmp_path: Path) -> None:
     rgb = Image.fromarray(np.random.default_rng(0).integers(0, 4, (12, 10, 3), np.uint8) * 80)
-    (gray := rgb.convert("L")).save(tmp_path / "gray.png")
+    gray = rgb.convert("L")
+    gray.save(tmp_path / "gray.png")
     assert (np.asarray(decode(tmp_path / "gray.png")) == np.asarray(gray)[..., None]).all()
-    (palette := rgb.quantize(256)).save(tmp_path / "palette.png")
+    palette = rgb.quantize(256)
+    palette.save(tmp_path / "palette.png")
     assert decode(tmp_path / "palette.png") == palette.convert("RGB")
     gray.point(lambda v: 255 * (v > 99)).convert("1").save(tmp_path / "bits.png")
     assert set(np.unique(decode(tmp_path / "bits.png"))) == {0, 255}

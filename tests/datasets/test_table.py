@@ -25,7 +25,8 @@ Table = list[dict[str, Any]]
 
 def table(file: Path, rows: Table) -> Path:
     with file.open("w", newline="") as stream:
-        (writer := csv.DictWriter(stream, list(rows[0]))).writeheader()
+        writer = csv.DictWriter(stream, list(rows[0]))
+        writer.writeheader()
         writer.writerows(rows)
     return file
 

@@ -143,7 +143,8 @@ def test_the_background_stands_for_the_first_frame() -> None:
 
 def test_a_stream_keeps_no_more_than_a_window_needs() -> None:
     clock = Clock()
-    (stream := Stream("touch", Counter(clock, 0, 64), clock=clock)).remember(0.5, 16)
+    stream = Stream("touch", Counter(clock, 0, 64), clock=clock)
+    stream.remember(0.5, 16)
     for k in range(100):
         clock.now = 99 + k / 10
         stream.pump()

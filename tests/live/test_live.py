@@ -44,7 +44,8 @@ class Other(Engine):
 
 
 def test_a_touch_is_found_answered_and_ended(engine: Engine) -> None:
-    (world := World(engine)).run(0.85)  # calibrates
+    world = World(engine)
+    world.run(0.85)  # calibrates
     assert [e.what for e in world.heard] == ["calibrated"]
     world.run(30 - 0.85)
     assert world.live.num_touches == 10
@@ -81,7 +82,8 @@ def test_the_newest_frame_wins_and_the_rest_are_counted(engine: Engine) -> None:
             world.clock.now += 0.004
             return super().__call__(**images)
 
-    (world := World(Slow(engine))).run(10, {"vision": 60.0, "touch": 10.0})
+    world = World(Slow(engine))
+    world.run(10, {"vision": 60.0, "touch": 10.0})
     age = world.live.summary()["age_ms"]  # from capture to answer
     assert age["p50"] == pytest.approx(4, abs=0.01) and age["max"] >= age["p99"] >= age["p50"]
     vision, touch = (world.streams[m][0] for m in ("vision", "touch"))
@@ -90,7 +92,8 @@ def test_the_newest_frame_wins_and_the_rest_are_counted(engine: Engine) -> None:
 
 
 def test_old_frames_are_not_used(engine: Engine) -> None:
-    (world := World(engine)).run(9)
+    world = World(engine)
+    world.run(9)
     world.rigs["vision"].fault = "stalled"
     world.run(0.4)
     before = world.live.num_predictions, world.live.num_stale
@@ -105,7 +108,8 @@ def test_old_frames_are_not_used(engine: Engine) -> None:
 def test_a_touch_ends_with_its_stream(engine: Engine) -> None:
     """Rather than go on for as long as the sensor is silent."""
     for name, fault in (("touch", "stalled"), ("touch", "unplugged"), ("vision", "unplugged")):
-        (world := World(engine)).run(2.5)
+        world = World(engine)
+        world.run(2.5)
         assert world.live.touch is not None and world.live.contact
         world.rigs[name].fault = fault
         world.run(1)
@@ -114,7 +118,8 @@ def test_a_touch_ends_with_its_stream(engine: Engine) -> None:
 
 
 def test_a_frame_that_comes_while_others_are_taken_is_used_once(engine: Engine) -> None:
-    (world := World(engine)).run(2.5)
+    world = World(engine)
+    world.run(2.5)
     [stream] = world.streams["touch"]
     newest, before = stream.newest, world.live.num_predictions
 
@@ -131,7 +136,8 @@ def test_a_frame_that_comes_while_others_are_taken_is_used_once(engine: Engine) 
 
 def test_a_background_is_forgotten_between_frames(engine: Engine) -> None:
     """Not by the thread that noticed, while another compares a frame with it."""
-    (world := World(engine)).run(2)
+    world = World(engine)
+    world.run(2)
     contact = world.live.contacts["touch"]
     world.rigs["touch"].fault = "resolution"
     world.streams["touch"][0].pump()  # as the capture thread does
@@ -252,14 +258,16 @@ def test_sources_by_name(tmp_path: Path) -> None:
     for text, says in (wrong | {f"{tmp_path}@fast": "'fast' is no"}).items():
         with pytest.raises(ValueError, match=says):
             source(text, "touch")
-    (missing := Stream("touch", source("97", "touch"), clock=Clock())).pump()
+    missing = Stream("touch", source("97", "touch"), clock=Clock())
+    missing.pump()
     assert missing.fault == "unplugged"
 
 
 def test_a_video_is_read_to_its_end_without_opencv(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     write_video(tmp_path / "a.mp4", 3, lambda number: numbered(number, "touch"))
-    (file := source(str(tmp_path / "a.mp4"), "touch")).open()
+    file = source(str(tmp_path / "a.mp4"), "touch")
+    file.open()
     frames = [file.read() for _ in range(3)]
     assert file.times.tolist() == pytest.approx([0, 0.04, 0.08])
     assert [read_number(frame) for frame in frames] == [(number, "touch") for number in range(3)]  # RGB
@@ -293,9 +301,11 @@ def test_a_camera_is_asked_for_a_mode(monkeypatch: pytest.MonkeyPatch) -> None:
             return True
 
     monkeypatch.setattr(cv2, "VideoCapture", Device)
-    (fast := source("3@320x240@60", "touch")).open()
+    fast = source("3@320x240@60", "touch")
+    fast.open()
     assert isinstance(fast, Camera) and fast.capture == {width: 320, height: 240, fps: 60}
-    (usual := source("/dev/video2", "touch")).open()
+    usual = source("/dev/video2", "touch")
+    usual.open()
     assert isinstance(usual, Camera) and usual.which == "/dev/video2"
     for text in ("3@60", "3@333x240"):
         with pytest.raises(OSError, match="no such mode: it gives 640x"):
@@ -370,7 +380,8 @@ def test_a_recording_is_a_pack(engine: Engine, tmp_path: Path) -> None:
         kept.append((columns["time"], images["touch"]))
         recorder(images, columns)
 
-    (world := World(engine, record=record)).run(40)
+    world = World(engine, record=record)
+    world.run(40)
     assert recorder.close() == pytest.approx(200, abs=4)
     pack, times = Pack(tmp_path / "pack"), dict(kept)
     for row in (0, 77, pack.num - 1):

@@ -147,7 +147,8 @@ def test_moco_contrasts_with_the_queue_then_fills_it() -> None:
 
 def test_queues_and_negatives_are_a_share_of_the_rows() -> None:
     """An eighth; and TAG's 16,384 for its 91,982 rows, or as many per row for fewer."""
-    (method := MoCoConfig(hidden=8, out=4).build(Toy().spec(), TINY)).prepare(ROWS)
+    method = MoCoConfig(hidden=8, out=4).build(Toy().spec(), TINY)
+    method.prepare(ROWS)
     assert all(len(queue.keys) == 10 for queue in method.queues.values())
     assert [MoCoConfig(queue=4096).queue_size(num) for num in (1, 12, 96, 1_281_167)] == [1, 1, 12, 4_096]
     assert [CMCConfig().negatives(num) for num in (3, 3_900, 91_982)] == [1, 702, 16_384]

@@ -17,7 +17,8 @@ RUN = replace(recipe("smoke"), optim=Optim(lr=1e-3), method=MViTacConfig(hidden=
 
 def build(run: Run = RUN, norm: bool = True, num_rows: int = 12) -> Method:
     torch.manual_seed(0)
-    (method := run.method.build(Toy().spec(), run.encoder)).prepare(torch.arange(num_rows))
+    method = run.method.build(Toy().spec(), run.encoder)
+    method.prepare(torch.arange(num_rows))
     for layer in method.modules():
         if isinstance(layer, nn.BatchNorm2d):
             nn.init.ones_(layer.weight)  # timm starts each block's last BatchNorm at zero, which would hide the block

@@ -33,6 +33,7 @@ class ObservationEncoder(nn.Module):
 
         Args:
             keys: modality of each observation key. Two gels of one gripper are two keys of "touch", left first.
+                A model of windows takes a key for each frame, the newest first.
             state: length of "observation.state" to append; 0 = none.
             tune: let the policy's loss train the encoders (BatchNorm keeps its statistics); otherwise they are frozen.
         """
