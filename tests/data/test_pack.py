@@ -48,6 +48,11 @@ def test_a_folder_that_is_called_as_the_home_folder(tmp_path: Path, monkeypatch:
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     assert toy_pack(Path("~/pack")).table == Pack("~/pack").table and (tmp_path / "~/pack").exists()
     assert len(read_manifest(Path("~/pack/samples.parquet")).rows) == 120
+    os.truncate("~/pack/touch.npy", 1 << 40)  # takes no disk, and hours to hash
+    with pytest.raises(
+        ValueError, match=r"touch\.npy cannot be mapped \(it has \d+ bytes beside its images, not 128\)"
+    ):
+        Pack("~/pack")
     monkeypatch.setenv("MVITAC_CACHE", "~/kept")
     assert cache_dir() == tmp_path / "home/kept"
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 import shutil
 import signal
@@ -495,6 +496,9 @@ def test_the_command_from_dry_run_to_tables(pack: Pack, tmp_path: Path, capsys: 
     assert main([*words, "--dry-run"]) == 0
     shown = capsys.readouterr().out
     assert "2 rows x 1 seeds = 2 runs" in shown and not (tmp_path / "out").exists() and "2 runs left" in shown
+    os.mkfifo(tmp_path / "pipe.toml")
+    assert main(["compare", "--plan", str(tmp_path / "pipe.toml"), "--dry-run"]) == 2
+    assert "pipe.toml is neither a file nor a folder" in capsys.readouterr().err
     (own := tmp_path / "out/table.csv").parent.mkdir()
     own.write_text("mine")
     assert main(words) == 2 and "is not empty, and holds no comparison" in capsys.readouterr().err

@@ -27,7 +27,7 @@ class _ProbeOptions:
     on: Path | None = None
     """Probe on this pack instead of the data the runs were trained on."""
     learn_on: Path | None = None
-    """Fit the probes on the train rows of this pack, score them on the test rows of --on: transfer without labels."""
+    """Fit the probes on train and val of this pack, score them on the test rows of --on: transfer without labels."""
     allow_leak: bool = False
     """Score a run also on rows or groups of --on that it was trained on. LEAK stands beside every such score."""
     per_class: bool = False

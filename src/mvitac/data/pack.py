@@ -267,6 +267,8 @@ class Pack:
                 images = np.load(path, mmap_mode="r", allow_pickle=False)
             if images.shape != expected or images.dtype != np.uint8:
                 raise ValueError(f"it holds {images.dtype} {images.shape}, pack.json promises uint8 {expected}")
+            if (rest := path.stat().st_size - images.nbytes) != images.offset:  # else a sparse file is hashed for hours
+                raise ValueError(f"it has {rest} bytes beside its images, not {images.offset}")
             return images
         except Exception as error:  # numpy raises many kinds for a damaged header
             raise ValueError(f"{path} cannot be mapped ({brief(error)}): the pack is damaged, make it again") from None

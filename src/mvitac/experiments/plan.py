@@ -13,7 +13,7 @@ from mvitac.methods.base import MethodConfig
 from mvitac.recipes import recipe, with_method
 from mvitac.registry import check_known, check_range, default, from_json, to_json, unknown
 from mvitac.run import Run
-from mvitac.system.files import SEAL, brief, parse_json, parse_toml
+from mvitac.system.files import SEAL, brief, check_ordinary, parse_json, parse_toml
 
 PLANS = ("table1", "table2", "ablation", "recipes")
 Printed = dict[str, dict[str, float]]  # modality -> task -> top-1 accuracy in percent as printed in the paper
@@ -129,6 +129,7 @@ def find_plan(given: str) -> Plan:
     if path.suffix not in (".toml", ".json"):
         raise unknown("plan", given, [*PLANS, "a .toml file", "a .json file"])
     try:
+        check_ordinary(path)  # a pipe never ends
         text = path.read_text()
         value = parse_toml(text) if path.suffix == ".toml" else parse_json(text)
     except FileNotFoundError:

@@ -41,7 +41,7 @@ def write_report(
     ``pack`` is shown instead of the runs' own. ValueError if a run is unfinished, or ``result`` is about others.
     """
     place = Path(out) / "report.html"
-    if place.exists() and WRITTEN not in place.read_text(errors="replace"):
+    if place.is_file() and WRITTEN not in place.read_text(errors="replace"):
         raise ValueError(f"{place} is no report: choose another --out")
     runs = open_runs(paths)
     if pack is None and len({r.record.get("pack") for r in runs}) > 1:
