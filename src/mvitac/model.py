@@ -50,7 +50,8 @@ class Model(nn.Module):
         foreign: Whether it is from an artifact, which may be a stranger's: no place that ``run`` names is opened.
     """
 
-    foreign, thread_safe = False, True  # other people's trunks may keep what they computed
+    foreign = False
+    thread_safe = True  # whether several threads may call one trunk at once: other people's may keep what they computed
 
     def __init__(self, method: Method, run: Run, spec: DataSpec, stored: int) -> None:
         super().__init__()

@@ -113,6 +113,6 @@ def places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
     text = cells.dtype.kind not in "biuf"
     place = np.array([number_of(str(cell)) for cell in cells] if text else cells, float)  # None is NaN
     if not np.isfinite(place).all():
-        row = int(np.flatnonzero(~np.isfinite(place))[0])
+        row = pack.own_ids[~np.isfinite(place)][0]
         raise ValueError(f"{pack.path}: column {name!r} is not a number in row {row}: give all rows one")
     return name, place

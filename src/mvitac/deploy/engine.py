@@ -179,7 +179,8 @@ def open_model(path: Path, engine: Runtime = "auto", precision: str = "fp32", th
 
 
 def _has_vnni() -> bool:
-    """Whether the CPU has instructions for 8-bit products; else OpenVINO 2026.4, on a busy machine, errs now and then."""
+    """Whether the CPU has instructions for 8-bit products. Without them OpenVINO 2026.4 now and then computes a wrong
+    int8 result (two threads, busy machine)."""
     flags = Path("/proc/cpuinfo")
     return "AVX2" not in os.environ.get("ONEDNN_MAX_CPU_ISA", "") and flags.exists() and "vnni" in flags.read_text()
 

@@ -118,7 +118,8 @@ def _counts(records: Sequence[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _shares(record: dict[str, Any], sizes: np.ndarray) -> np.ndarray:
-    """Each group's share in R2, times the rows (jackknife): [G], sum R2 * rows. For an accuracy: its correct rows."""
+    """Each group's share in R2, times the number of rows: [G], with sum R2 * rows. It comes from R2 without the group
+    (the jackknife). For an accuracy the same formula gives the correct rows."""
     if np.count_nonzero(sizes) < 2:
         return record["r2"] * sizes
     shares = sizes * record["r2"] + (sizes.sum() - sizes) * (record["r2"] - r2_without_each_group(record))
@@ -186,7 +187,8 @@ def _margin(groups: _Variance, seeds: _Variance) -> float:
 
 
 def _margin_and_p(mean: float, groups: _Variance, seeds: _Variance, num_groups: int) -> tuple[float, float]:
-    """``_margin`` and p of a mean. Where p is always above .05 (two equal groups have no width), 0 is in the interval."""
+    """``_margin`` and p of a mean that 0 is compared with: where p is always above .05, the interval has 0 in it. Two
+    groups of equal gaps would otherwise give an interval of no width."""
     p = max(_p(mean, groups + seeds), _p(mean, seeds) if seeds.value else 0, least_p(num_groups))
     return max(_margin(groups, seeds), abs(mean) if least_p(num_groups) > 0.05 else 0), p
 

@@ -111,7 +111,8 @@ def _latents(thing: objects.Thing, patch: skin.Patch, plan: physics.Plan) -> dic
 def _pressed(
     bench: physics.Bench, patch: skin.Patch, touch: physics.Touch, side: int, grid: int
 ) -> tuple[np.ndarray, dict[str, float]]:
-    """The imprint [grid, grid] in mm of the object, seen from behind the gel, row 0 up; depth_mm, shear_x_n, ... of it."""
+    """Return the imprint [grid, grid] in mm of the object in one gel, seen from behind the gel; row 0 is up. The dict
+    is what physics knows of the contact: depth_mm, shear_x_n, ..."""
     pixel, pressed = FIELD_MM / grid, np.zeros((grid, grid), np.float32)
     if touch.normal_n > 0 and (relief := _relief(bench, patch, side, grid)) is not None:
         spring = {"stiffness": bench.thing.stiffness, "pixel_mm": pixel, "dome_radius_mm": objects.DOME_RADIUS_MM}

@@ -87,7 +87,8 @@ class Step:
             with torch.no_grad(), self.autocast():
                 keys.append(method.keys(views))
 
-        # Losses over the embeddings of all processes, and the gradient of each of this one: without communication.
+        # Losses over the embeddings of all processes, and the gradient of each of this process. Every process computes the
+        # whole loss, so that this needs no communication.
         own = {name: torch.cat([z[name].detach() for z in queries]) for name in queries[0]}
         all_queries = {name: world.gather(z).requires_grad_() for name, z in own.items()}
         all_keys = {name: world.gather(torch.cat([z[name] for z in keys])) for name in keys[0]}

@@ -114,9 +114,8 @@ class ParquetCell(ImageRef):
     @contextmanager
     def opened(self) -> Iterator[pa.ChunkedArray]:
         try:
-            values = (
-                pq.ParquetFile(Path(self.path).absolute()).read_row_group(self.group, columns=[self.column]).column(0)
-            )
+            file = pq.ParquetFile(Path(self.path).absolute())
+            values = file.read_row_group(self.group, columns=[self.column]).column(0)
         except (pa.ArrowException, OSError) as error:
             raise ValueError(f"{self.path} cannot be read ({brief(error)})") from None
         yield values
