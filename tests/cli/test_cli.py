@@ -86,6 +86,16 @@ def test_advice_is_of_the_command_and_home_is_read(
         assert run.call_args.args == ([name, "--out=/home/me/x"],)
 
 
+def test_a_current_folder_that_was_deleted_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (gone := tmp_path / "gone").mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert main(["probe", str(tmp_path)]) == 2
+    assert capsys.readouterr().err == "mvitac: error: the current folder was deleted: change to another\n"
+
+
 def test_a_full_stdout_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdout", Mock(write=Mock(side_effect=OSError(28, "No space left on device"))))
     with pytest.raises(OSError, match="No space left on device: 'stdout'"):

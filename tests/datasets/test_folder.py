@@ -179,6 +179,15 @@ def test_two_ways_to_type_a_name_are_one(tmp_path: Path, rows: Table) -> None:
     assert pack.digest == other.digest
 
 
+def test_a_blank_is_part_of_a_files_name_where_one_has_it(tmp_path: Path) -> None:
+    for name, level in {" a": 40, "a": 200, "b": 90}.items():
+        Image.new("RGB", (20, 20), (level,) * 3).save(tmp_path / f"{name}.png")
+    typed = [{"touch": cell} for cell in (" a.png", "a.png", " b.png ")]
+    for path in (tmp_path, write(typed, tmp_path / "typed.csv"), write(typed, tmp_path / "typed.jsonl")):
+        pack = packed(config(path, allow_leak=True, labels=(), group=None), tmp_path / f"{path.name}-pack")
+        assert [int(image.mean()) for image in pack.images["touch"]] == [40, 200, 90], path
+
+
 @pytest.mark.parametrize(("cell", "wanted"), [("0.10", "0.1"), ("10.0", "10"), ("True", "true"), ("2", "2")])
 def test_equal_numbers_and_truths_are_equal(cell: str, wanted: str) -> None:
     assert Condition.parse(f"a={wanted}").holds({"a": cell}) and not Condition.parse(f"a!={wanted}").holds({"a": cell})

@@ -438,6 +438,20 @@ def test_a_running_recording_is_not_finished_by_another(tmp_path: Path) -> None:
     assert (recorder.spool / "thesis.tex").exists()
 
 
+def test_a_recording_that_was_moved_away_ends(tmp_path: Path) -> None:
+    said: list[str] = []
+    recorder, image = Recorder(tmp_path / "out", fps=1.0, tell=said.append), np.zeros((16, 16, 3), np.uint8)
+    for i in range(200):
+        if i == 100:
+            recorder.spool.rename(tmp_path / "moved")
+        recorder({"touch": image}, {"time": float(i), "contact": True, "touch_number": 1})
+    assert said == [f"recording stopped, prediction goes on: {recorder.spool}: it was deleted or moved"]
+    with pytest.raises(ValueError, match="put it back where it was, and finish it by"):
+        recorder.close()
+    (tmp_path / "moved").rename(recorder.spool)
+    assert finish(tmp_path / "out") == 64
+
+
 def test_a_recording_that_nothing_came_of_is_not_in_the_way(tmp_path: Path) -> None:
     Recorder(out := tmp_path / "recording")  # killed before its first part
     assert finish(out) == 0 and not list(tmp_path.iterdir())

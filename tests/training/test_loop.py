@@ -116,6 +116,12 @@ def test_a_log_ends_before_what_is_none(tmp_path: Path) -> None:
         read_log(tmp_path)
 
 
+def test_a_run_that_could_not_be_read_again_does_not_begin(pack: Pack, tmp_path: Path) -> None:
+    run = smoke(pack, positives="same_image")
+    with pytest.raises(ValueError, match=r"unknown value of run.positives 'same_image': .* did you mean 'same-image'\?"):
+        train(run, tmp_path / "r", quiet=True)
+
+
 def test_killed_between_two_checkpoints(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
     run = cut_after(5, pack, tmp_path / "r")
     os.replace(tmp_path / "r" / CHECKPOINT, tmp_path / "r" / PREVIOUS)

@@ -92,6 +92,10 @@ def _run(arguments: list[str]) -> int:
     if arguments[0] == "--version":
         print(__version__)
         return 0
+    try:
+        Path.cwd()
+    except FileNotFoundError:  # torch would end the program without a word
+        raise ValueError("the current folder was deleted: change to another") from None
     name, rest = arguments[0], arguments[1:]
     if name == "data" or (rest and f"{name} {rest[0]}" in COMMANDS):
         name, rest = f"{name} {rest[0]}", rest[1:]

@@ -71,6 +71,8 @@ class Recorder:
         buffer = io.BytesIO()
         np.savez(buffer, crop=self.crop, **arrays, **columns)  # type: ignore[arg-type]
         try:
+            if not self.spool.exists():
+                raise FileNotFoundError(0, "it was deleted or moved", self.spool)
             write_atomic(self.spool / f"{self.num:08d}.npz", lambda file: file.write(buffer.getvalue()))
         except OSError as error:
             if not self.failed:
@@ -87,7 +89,8 @@ class Recorder:
             with self.held:
                 return finish(self.out)
         except (OSError, ValueError) as error:
-            kept = f"{self.num} pairs are kept in {self.spool}, make room and finish them by"
+            there = f"{self.num} pairs are kept in {self.spool}, make room and finish them by"
+            kept = there if self.spool.exists() else "put it back where it was, and finish it by"
             raise ValueError(f"{brief(error)}: {kept} {_command(self.out)}") from None
 
 

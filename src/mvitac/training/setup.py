@@ -23,7 +23,7 @@ from mvitac.methods.base import Method
 from mvitac.model import Model, load
 from mvitac.nn.encoders import IMAGENET, SCRATCH, Seeded, build_trunk
 from mvitac.nn.imagenet import source
-from mvitac.registry import to_json
+from mvitac.registry import from_json, to_json
 from mvitac.run import Run, load_run, precision_of
 from mvitac.system.device import Hardware, describe, has_bf16, pick_device
 from mvitac.system.distributed import World, local_device
@@ -94,7 +94,11 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
 
 
 def check_start(asked: Run, out: Path) -> tuple[Run, torch.device]:
-    """The run with the digest of its start weights, and its device; ValueError without them, before data is made."""
+    """The run with the digest of its start weights, and its device; ValueError if it could not be read again.
+
+    All before data is made.
+    """
+    from_json(Run, to_json(asked))
     for file in leaks.weights_files(asked) if not (out / "run.json").exists() else ():
         if not file.is_file():
             raise ValueError(f"weights {str(file)!r}: give imagenet, scratch, or a file that exists")

@@ -43,8 +43,8 @@ class Recordings(Source):
         rng = np.random.default_rng([11, item])
         force = 0.2 + (2.5 + 0.1 * (k // 2 % 4)) * np.sin(np.pi * i / LENGTH) + 0.01 * rng.normal()
         tilt = 0.3 * np.sin(k + i / 5)
-        if fault == "placeholder" and i % 8 == 5:
-            force = -1.0
+        if "placeholder" in fault and i % 8 == 5:
+            force = -1.0 if item > 5 or fault == "placeholder" else -999.0
         if fault == "outlier" and i == 5:
             force = -999.0
         if fault == "stuck" and k == 4 and 10 <= i < 24:
@@ -90,6 +90,11 @@ def test_each_fault_is_found_and_no_other(tmp_path: Path, fault: str, item: str,
     assert found[item].verdict == "look" and says in found[item].evidence, found[item]
     assert set(rows) <= set(found[item].rows) and [f.item for f in found.values() if f.verdict != "ok"] == [item]
     assert ";" not in found[item].advice  # one thing to do
+
+
+def test_an_outlier_hides_no_placeholder(tmp_path: Path) -> None:
+    (force, _) = value_checks.values(packed(tmp_path / "pack", "placeholder, outlier"))
+    assert "1 outliers, e.g. -999" in force.evidence and "79 of 639 (12.4 %) rows have -1 exactly" in force.evidence
 
 
 def test_two_recordings_in_one_touch_hide_no_stuck_sensor_of_another(tmp_path: Path) -> None:

@@ -36,9 +36,11 @@ def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, tou
     evidence = [f"{len(rows)} rows, {low:.4g} to {high:.4g} {target.unit}, median {middle:.4g}"]
     if missing := sum(map(len, sides.values())) - len(rows):
         evidence.append(f"{share(missing, missing + len(rows))} rows of train, val and test have none")
+    far = _outliers(rows, known, pack.own_ids)
+    near = ~np.isin(rows, far[1])  # -1 is still a placeholder beside one -999
     checks = {
-        "repair these cells, or leave them empty": _outliers(rows, known, pack.own_ids),
-        "a placeholder or a saturated sensor: leave these cells empty": _placeholder(rows, known),
+        "repair these cells, or leave them empty": far,
+        "a placeholder or a saturated sensor: leave these cells empty": _placeholder(rows[near], known[near]),
         "a stuck or saturated sensor: leave these cells empty": _stuck(found, touches, pack.own_ids),
         "expect larger errors there, or split so that train covers test": _outside(
             found, pack.rows("train", only=task.only, by=task.split), measured["test"], target

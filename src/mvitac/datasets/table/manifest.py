@@ -19,6 +19,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from mvitac.data.images import IMAGES
 from mvitac.data.video import VIDEOS
 from mvitac.datasets.table.image_refs import Frame, ImageRef, Refs
 from mvitac.registry import unknown
@@ -140,6 +141,8 @@ class Manifest:
         for i, row in enumerate(self.rows):
             cell, number = row[column], row.get(counter, "")
             path = os.path.join(root, cell)
+            if cell != cell.strip() and not os.path.lexists(path):  # blanks of who typed the table
+                path = os.path.join(root, cell := cell.strip())
             if not cell:
                 refs.append(None)
             elif not cell.lower().endswith(VIDEOS):
@@ -152,10 +155,15 @@ class Manifest:
 
 
 def text_of(value: Any) -> str:
-    """Return a cell as text, the same for each file format: whole numbers without '.0', NaN and null as ''."""
+    """Return a cell as text, the same for each file format: whole numbers without '.0', NaN and null as ''.
+
+    Blanks around it are removed, but not those of a file's name: " 1.png" and "1.png" may both exist.
+    """
     text = "" if value is None else str(value).strip()
     if text in NAN:
         return ""
+    if text.lower().endswith((*IMAGES, *VIDEOS)):
+        return str(value)
     # pandas writes an integer column with a missing value as 1.0, 2.0, ...: these are the classes 1 and 2.
     return re.sub(r"^(-?\d+)\.0+$", r"\1", text) if ".0" in text else text
 
