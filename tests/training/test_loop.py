@@ -118,7 +118,7 @@ def test_a_log_ends_before_what_is_none(tmp_path: Path) -> None:
 
 def test_a_run_that_could_not_be_read_again_does_not_begin(pack: Pack, tmp_path: Path) -> None:
     run = smoke(pack, positives="same_image")
-    with pytest.raises(ValueError, match=r"unknown value of run.positives 'same_image': .* did you mean 'same-image'\?"):
+    with pytest.raises(ValueError, match=r"unknown value of run\.positives 'same_image': .* did you mean"):
         train(run, tmp_path / "r", quiet=True)
 
 
