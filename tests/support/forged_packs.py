@@ -1,9 +1,12 @@
 """Files changed behind the library's back; of packs with digests that agree with the change."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from mvitac.system.files import digest, digest_file
 
@@ -42,3 +45,11 @@ def described(*keys: str, value: Any) -> Spoil:
         seal(path)
 
     return spoil
+
+
+def refuse_pipe(path: Path, read: Callable[[], object], says: str = "neither a file nor a folder") -> None:
+    """Put a pipe in the place of ``path``: reading it would wait for ever."""
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+    with pytest.raises(ValueError, match=says):
+        read()

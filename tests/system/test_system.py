@@ -1,7 +1,6 @@
 """Files, locks, threads and progress: complete or not at all, the same side by side, and nothing goes unnoticed."""
 
 import json
-import os
 import shutil
 import threading
 from dataclasses import replace
@@ -24,6 +23,7 @@ from mvitac.system.files import check_place, read_json, write_json
 from mvitac.system.locks import Busy, new_folder
 from mvitac.system.progress import say, shown, tick, work
 from mvitac.system.threads import in_threads
+from support.forged_packs import refuse_pipe
 from support.processes import begin, finish
 
 COMMANDS = {
@@ -63,11 +63,9 @@ def test_links_stay_and_devices_are_refused(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "target")
     write_json(tmp_path / "link", [1])
     assert (tmp_path / "link").is_symlink() and json.loads((tmp_path / "target").read_text()) == [1]
-    os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(ValueError, match="pipe is neither a file nor a folder"):
-        check_place(tmp_path / "pipe")
-    with pytest.raises(ValueError, match="pipe is neither a file nor a folder"):
-        read_json(tmp_path / "pipe", "a record")
+    pipe, says = tmp_path / "pipe", "pipe is neither a file nor a folder"
+    refuse_pipe(pipe, lambda: check_place(pipe), says)
+    refuse_pipe(pipe, lambda: read_json(pipe, "a record"), says)
     check_place(Path("/"))  # it is there
 
 
