@@ -31,10 +31,6 @@ GEL, KINECT = (24, 32, 3), (54, 96, 3)
 OBJECTS = ("lemon", "lime", "potato", "onion", "soft_zebra", "metal_can", "some_other_thing")
 
 
-def pixel(shard: int, index: int, sensor: int, phase: int) -> int:
-    return (shard * 97 + index * 9 + sensor * 3 + phase) % 256
-
-
 def write_shard(
     folder: Path, shard: int, objects: Sequence[bytes | str | None], *, leak: bool = False, grip: Any = None
 ) -> Path:
@@ -50,7 +46,7 @@ def write_shard(
             for s, (sensor, shape) in enumerate((("gelsightA", GEL), ("gelsightB", GEL), ("kinectA_rgb", KINECT))):
                 for p, phase in enumerate(PHASES):
                     image = rng.integers(0, 256, shape, np.uint8)
-                    image[0, 0] = pixel(shard, index, s, p)
+                    image[0, 0] = (shard * 97 + index * 9 + s * 3 + p) % 256
                     if leak and phase == "after":
                         image[:] = 220 if gripping else 30
                     group.create_dataset(f"{sensor}_{phase}", data=image, compression="gzip", compression_opts=1)
@@ -70,13 +66,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
-def packed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Pack:
-    config = CalandraConfig(path=folder, size=24)
-    return build(config.source(), tmp_path_factory.mktemp("packed") / "p", size=24, quiet=True)
-
-
-def test_every_image_is_in_its_place(folder: Path, packed: Pack) -> None:
+def test_every_image_is_in_its_place(folder: Path, tmp_path: Path) -> None:
     source = CalandraConfig(path=folder, split="object").source()
     assert source.items()[:3] == [f"calandra_corl2017_000.h5 i{i}" for i in range(3)]
     assert source.items()[14:] == [f"calandra_corl2017_002.h5 i{i}" for i in range(12)]  # i10 after i9, not after i1
@@ -90,6 +80,7 @@ def test_every_image_is_in_its_place(folder: Path, packed: Pack) -> None:
             assert np.array_equal(sample.touch, both) and np.array_equal(sample.vision, raw[f"kinectA_rgb_{phase}"])
             assert sample.columns["outcome"] == index % 2
             assert sample.columns["touch_group"] == f"{shard:03d}-{index:03d}"
+    packed = build(CalandraConfig(path=folder, size=24).source(), tmp_path / "p", size=24, quiet=True)
     assert packed.num == 3 * 24  # two of the 26 grasps are of an object outside the 40
 
 

@@ -41,16 +41,10 @@ class Felt(Grasps):
         return [Sample(vision=vision.astype(np.uint8), touch=touch.astype(np.uint8), columns=columns)]
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("felt")
-    pack = build(Felt(), folder / "pack", size=16, quiet=True)
-    (folder / "run").mkdir()
-    fresh(smoke(pack), pack.spec, pack.size).save(folder / "run" / "model.safetensors")
-    return folder / "run"
-
-
-def test_touch_that_knows_lifts_like_the_oracle(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_touch_that_knows_lifts_like_the_oracle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pack = build(Felt(), tmp_path / "pack", size=16, quiet=True)
+    (run := tmp_path / "run").mkdir()
+    fresh(smoke(pack), pack.spec, pack.size).save(run / "model.safetensors")
     regrasp.main([str(run), "--seeds", "2", "--candidates", "2", "--json", str(tmp_path / "found.json")])
     found: dict[str, Any] = json.loads((tmp_path / "found.json").read_text())
     success = {name: rules["again"]["mean"] for name, rules in found["success"].items()}

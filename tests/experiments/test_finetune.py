@@ -44,12 +44,6 @@ def one_precision() -> Iterator[None]:
         yield
 
 
-@pytest.fixture
-def often(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A checkpoint after every step of short runs, too."""
-    monkeypatch.setattr("mvitac.training.loop.MIN_BETWEEN_CHECKPOINTS", 1)
-
-
 @pytest.fixture(scope="module")
 def ancestor(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(smoke(pack, eval_every=0), tmp_path_factory.mktemp("ancestor") / "run", quiet=True)
@@ -193,9 +187,11 @@ def test_test_labels_decide_nothing(ancestor: Path, pack: Pack, tuned: Path, tmp
     assert now <= 1 - right + 1e-9  # the rows that were right are wrong now
 
 
-@pytest.mark.usefixtures("often")
 @pytest.mark.parametrize("after", [4, 7])  # while settings are tried, and in the final run
-def test_killed_and_resumed_is_straight(ancestor: Path, pack: Pack, tuned: Path, tmp_path: Path, after: int) -> None:
+def test_killed_and_resumed_is_straight(
+    ancestor: Path, pack: Pack, tuned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: int
+) -> None:
+    monkeypatch.setattr("mvitac.training.loop.MIN_BETWEEN_CHECKPOINTS", 1)  # also of short runs, after every step
     asked = replace(ASKED, from_scratch=False)
     with power_cut(after), pytest.raises(RuntimeError, match="power cut"):
         tune(ancestor, pack, tmp_path / "out", asked)

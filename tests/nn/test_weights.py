@@ -20,16 +20,11 @@ from mvitac.nn.imagenet import source
 from mvitac.nn.weights import State, load_weights, read_tensors
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A local stand-in for an ImageNet checkpoint: a whole resnet10t with its 1000-way classifier."""
+def test_a_random_stem_changes_nothing_else(tmp_path: Path) -> None:
+    """The file stands in for an ImageNet checkpoint: a whole resnet10t with its 1000-way classifier."""
     torch.manual_seed(11)
-    path = tmp_path_factory.mktemp("weights") / "resnet10t.safetensors"
-    safetensors.torch.save_file(timm.create_model("resnet10t").state_dict(), path)
-    return path
-
-
-def test_a_random_stem_changes_nothing_else(weights: Path) -> None:
+    weights = tmp_path / "resnet10t.safetensors"
+    safetensors.torch.save_file(timm.create_model("resnet10t").state_dict(), weights)
     repeated, random = (
         build_trunk(EncoderConfig(trunk="resnet10t", weights=str(weights), stem=stem), 6).state_dict()
         for stem in ("repeat", "random")

@@ -293,13 +293,9 @@ def test_learning_rate_schedules() -> None:
     assert [Optim(lr=1.0, schedule="step").rate(0, 1, e) for e in (0, 9, 10, 25)] == pytest.approx([1, 1, 0.9, 0.81])
 
 
-@pytest.fixture(scope="module")
-def twice(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+def test_the_other_sensors_view_is_of_the_same_press(pack: Pack, tmp_path: Path) -> None:
     config = MaterialsConfig(num=40, touches=2, sensors_per_press=2, size=16)
-    return build(config.source(), tmp_path_factory.mktemp("twice") / "p", size=16, quiet=True)
-
-
-def test_the_other_sensors_view_is_of_the_same_press(twice: Pack, pack: Pack) -> None:
+    twice = build(config.source(), tmp_path / "p", size=16, quiet=True)
     rows = twice.rows("train")
     run = replace(recipe("smoke", PackConfig(path=twice.path)), augment=Augment(size=16))
     assert asked(run, twice, rows)[0] == [2, 2]
