@@ -2,10 +2,10 @@
 
 import csv
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -56,29 +56,24 @@ def test_a_video_and_a_frame_number_give_that_very_frame(films: Path, tmp_path: 
     file = table(films / f"table{workers}.csv", rows)
     pack = packed(file, tmp_path / "pack", workers=workers, labels=("label",), group="take")
     assert pack.num == len(rows)
-    for i, name in enumerate(pack.column("id")):
-        row = rows[int(name) - 1]
+    for i, number in enumerate(pack.column("id").astype(int)):
+        row = rows[number - 1]
         k, frame = row["take"], row["frame"]
         assert abs(level(pack.images["vision"][i]) - shade(frame, k)) < 6
         assert abs(level(pack.images["touch"][i]) - shade(row["touch_frame"], k + 1)) < 6
 
 
 def test_every_video_is_decoded_once(films: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[str, list[int]]] = []
-    real = video.frames
-
-    def frames(path: str, indices: Sequence[int], **options: Any) -> Any:
-        asked.append((path, list(indices)))
-        return real(path, indices, **options)
-
+    frames = Mock(wraps=video.frames)
     monkeypatch.setattr(video, "frames", frames)
     packed(table(films / "once.csv", film_rows()), tmp_path / "p", labels=("label",), group="take")
+    asked = [call.args for call in frames.call_args_list]
     assert len(asked) == 8 == len({path for path, _ in asked})
     assert all(indices == sorted(set(indices)) and len(indices) == 12 for _, indices in asked)
     monkeypatch.setattr(rows_module, "MAX_TOGETHER", 5)  # what is too much for the memory is read in turns
-    asked.clear()
+    frames.reset_mock()
     packed(table(films / "once.csv", film_rows()), tmp_path / "q", labels=("label",), group="take")
-    assert len(asked) == 3 * 8 and Pack(tmp_path / "q").digest == Pack(tmp_path / "p").digest
+    assert frames.call_count == 3 * 8 and Pack(tmp_path / "q").digest == Pack(tmp_path / "p").digest
     monkeypatch.setattr(rows_module, "MAX_TOGETHER_BYTES", 4 * 16 * 16 * 6)  # four rows of two images
     source = FolderConfig(path=films / "once.csv", size=16, labels=("label",), group="take").source()
     assert list(source.samples_per_item()) == [4, 4, 4] * 4
@@ -218,8 +213,7 @@ def test_backgrounds_by_row(tmp_path: Path) -> None:
             picture(tmp_path / f"own{i}.png", free + i)
         pack = packed(table(tmp_path / "m.csv", rows), tmp_path / f"p{free}", labels=("label",), difference=True)
         assert pack.spec.difference
-        for i, name in enumerate(pack.column("id")):
-            number = int(name) - 1
+        for i, number in enumerate(pack.column("id").astype(int) - 1):
             assert (pack.images["touch"][i] == (rows[number]["value"] - free - number + 256) // 2).all()
 
 
@@ -228,8 +222,7 @@ def test_backgrounds_by_sensor(tmp_path: Path) -> None:
     options: dict[str, Any] = {"labels": ("label",), "difference": True, "no_contact": ("phase=empty",)}
     pack = packed(table(tmp_path / "m.csv", rows), tmp_path / "p", **options)
     assert pack.num == 20 and set(pack.column("sensor")) == {"digit", "mini"}
-    for i, name in enumerate(pack.column("id")):
-        number = int(name) - 1
+    for i, number in enumerate(pack.column("id").astype(int) - 1):
         base = (60, 180)[number // 12]  # the mean of base - 1 and base + 1
         assert (pack.images["touch"][i] == (rows[number]["value"] - base + 256) // 2).all()
 

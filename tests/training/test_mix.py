@@ -23,8 +23,6 @@ from support.mixes import Gel, Slice, built, mix_run
 from support.small_methods import PAIRED, build, small
 from support.training_runs import assert_equal_weights, batches, log_of, smoke, train_twice, views_by
 
-MISSING = sorted(name for name, config in MethodConfig.choices.items() if config.takes_missing)
-
 
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
@@ -92,7 +90,7 @@ def ragged(method: Any, vision: int = 5, touch: int = 8) -> Views:
     return Views(images=images, labels={}, rows=torch.arange(3, touch + 4), both=both)
 
 
-@pytest.mark.parametrize("name", MISSING)
+@pytest.mark.parametrize("name", sorted(name for name, kind in MethodConfig.choices.items() if kind.takes_missing))
 def test_a_loss_is_of_the_rows_that_have_its_modality(name: str) -> None:
     """Each intra-modal loss equals that of a batch of these rows alone, and so do the methods' updates."""
     batch = ragged(method := build(name))

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -23,13 +24,12 @@ from mvitac.training import setup
 from mvitac.training.loop import train
 from mvitac.training.start import load_trunk
 from mvitac.transforms.random_views import Augment, ViewAugment
-from support.small_methods import small
+from support.small_methods import TINY, small
 from support.toy import Toy
 from support.training_runs import smoke, train_twice, weights
 
 VISION = "test_resnet.r160_in1k"  # 96 features; its inputs are normalised by .5, not by ImageNet's mean and deviation
-SMALL = EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)
-TWO = Encoders(vision=EncoderConfig(trunk=VISION, weights=SCRATCH), touch=SMALL)
+TWO = Encoders(vision=EncoderConfig(trunk=VISION, weights=SCRATCH), touch=TINY.touch)
 SIZES = Augment(size=32, vision=ViewAugment(size=24, whole=28), touch=ViewAugment(whole=30))
 
 
@@ -92,12 +92,11 @@ def test_a_locked_trunk(pack: Pack, file: Path, tmp_path: Path, monkeypatch: pyt
     run = started(pack, file, locked=True, pool="stages")
     run = replace(run, method=small(name), augment=replace(SIZES, vision=whole))
     monkeypatch.setenv("MVITAC_CACHE", str(tmp_path))
-    seen: list[str] = []
-    real = features.pack_features
-    monkeypatch.setattr(features, "pack_features", lambda *given, **how: seen.append(given[2]) or real(*given, **how))
+    read = Mock(wraps=features.pack_features)
+    monkeypatch.setattr(features, "pack_features", read)
     once = train_twice(run, tmp_path, cut=3)
     mvitac.probe(once, tasks=("bright",), controls=False)
-    assert seen.count("vision") == 1
+    assert [call.args[2] for call in read.call_args_list].count("vision") == 1
     monkeypatch.setattr(setup, "_once", lambda *_: False)
     train(run, tmp_path / "seen", quiet=True, validate=False)
     torch.testing.assert_close(weights(once), weights(tmp_path / "seen"), rtol=1e-3, atol=1e-4)
@@ -106,7 +105,7 @@ def test_a_locked_trunk(pack: Pack, file: Path, tmp_path: Path, monkeypatch: pyt
 def test_precision_is_measured_on_what_a_step_computes(pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
     """The features of a locked trunk are there already; eight small images take other kernels than a batch."""
     run, seen = recipe("locked", pack), []
-    made = build_trunk(EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH), 3)
+    made = build_trunk(TINY.touch, 3)
     made.register_forward_pre_hook(lambda _, args: seen.append(args[0].shape))
     built: list[str] = []
     monkeypatch.setattr(setup, "build_trunk", lambda config, *_: (built.append(config.trunk), made)[1])
