@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
@@ -30,6 +29,7 @@ from mvitac.training.views import StepViews
 from support.small_methods import TINY_VIT
 from support.small_steps import build as build_from
 from support.small_steps import gradients, split, views
+from support.training_runs import power_cut
 
 RUN = replace(recipe("smoke"), optim=Optim(name="sgd"), method=MViTacConfig(hidden=24, out=12), batch_size=12)
 METHODS: dict[str, MethodConfig] = {
@@ -104,16 +104,10 @@ def step(folder: Path) -> None:
 def train(place: str, out: Path, die_after: int) -> None:
     """The whole loop on a pack; every process dies after its ``die_after``-th batch, and notes the rows it saw."""
     real, seen = StepViews.make, []
-
-    def watched(self: StepViews, rows: np.ndarray, seed: int) -> object:
-        if len(seen) == die_after:
-            raise RuntimeError("power cut")
-        seen.append(rows.tolist())
-        return real(self, rows, seed)
-
-    StepViews.make = watched  # type: ignore[assignment]
+    StepViews.make = lambda self, rows, seed: seen.append(rows.tolist()) or real(self, rows, seed)  # type: ignore
     run = replace(recipe("smoke", PackConfig(path=Path(place))), steps=4, checkpoint_every=2, log_every=1)
-    pretrain(run, out, resume=True, quiet=True)
+    with power_cut(die_after):
+        pretrain(run, out, resume=True, quiet=True)
     torch.save(seen, out.with_name(f"{out.name}-rows{join().rank}.pt"))
 
 
