@@ -122,13 +122,12 @@ def locked(data: DatasetConfig, phased: bool) -> Run:
     base = quick(data, phased)
     whole = ViewAugment(scale=(1.0, 1.0), flip=0.0, grayscale=0.0, size=128)
     imagenet = EncoderConfig(trunk="tf_efficientnet_lite0", pool="stages", locked=True)
-    small = EncoderConfig(trunk="mvitac_resnet8", weights=SCRATCH, pool="stages")
     return replace(
         base,
         recipe="locked",
         method=replace(base.method, lambda_inter=2.0),
         optim=replace(base.optim, weight_decay=3.0),
-        encoder=Encoders(vision=imagenet, touch=small),
+        encoder=Encoders(vision=imagenet, touch=EncoderConfig(trunk="mvitac_resnet8", weights=SCRATCH, pool="stages")),
         augment=replace(base.augment, size=44, whole=66, vision=whole),
         steps=800,
         eval_every=800,
