@@ -97,9 +97,8 @@ def test_a_column_is_of_the_task_and_the_control_that_name_it(tmp_path: Path) ->
     mix = MixedPack(parts)
     assert [task.name for task in mix.spec.values] == ["depth/depth", "height/height"]
     for task, columns in zip(mix.spec.values, mix.spec.controls.values(), strict=True):
-        inside = mix.column("part") == task.name.partition("/")[0]
         for found in (mix.values(task)[:, 0], mix.column(columns[0])):
-            np.testing.assert_array_equal(np.isfinite(found), inside)
+            np.testing.assert_array_equal(np.isfinite(found), mix.column("part") == task.name.partition("/")[0])
 
 
 def pressed(first: int = 0, unit: str = "N", kind: Any = 1, own_split: bool = False) -> Toy:

@@ -116,25 +116,22 @@ def test_frames_are_upright(tmp_path: Path) -> None:
     assert (upright == np.rot90(plain, -1)).all()
 
 
-@pytest.fixture
-def count(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
-    counted = {"runs": 0, "packets": 0}
+def test_one_forward_pass_decodes_no_frame_twice_and_skips(
+    made: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count = {"runs": 0, "packets": 0}
     start, decode = video._Run.__init__, video._Run._decoded
 
     def counting_start(self: Any, *args: Any) -> None:
-        counted["runs"] += 1
+        count["runs"] += 1
         start(self, *args)
 
     def counting_decode(self: Any, packet: Any) -> Any:
-        counted["packets"] += packet is not None
+        count["packets"] += packet is not None
         return decode(self, packet)
 
     monkeypatch.setattr(video._Run, "__init__", counting_start)
     monkeypatch.setattr(video._Run, "_decoded", counting_decode)
-    return counted
-
-
-def test_one_forward_pass_decodes_no_frame_twice_and_skips(made: dict[str, Path], count: dict[str, int]) -> None:
     next(found := frames(made["mpeg4"], range(NUM)))
     assert count["packets"] <= 2  # each comes as it is decoded
     assert len(list(found)) == NUM - 1 and count == {"runs": 1, "packets": NUM}

@@ -25,8 +25,6 @@ from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.table.arrays import read_arrays
 from support.forged_packs import refuse_pipe
 
-SHORT = 200  # characters of an attribute
-
 
 def grays(*levels: int, channels: int = 3, side: int = 16) -> np.ndarray:
     """Images of one gray level each, uint8 [N, side, side + 4, channels]."""
@@ -70,7 +68,7 @@ LENGTHS = (3, 5, 4, 6)
 def demos(root: Path, name: str = "demos.hdf5", **changes: Any) -> Path:
     """robomimic's layout, 4 demonstrations: images of row i of demonstration k are 50 k + i (camera) and 20 + that."""
     content: dict[str, Any] = {"mask/train": np.array([b"demo_0"])}
-    attributes: dict[str, Any] = {"@robot": "arm", "data@total": 18, "data@env_args": "{}" * SHORT}
+    attributes: dict[str, Any] = {"@robot": "arm", "data@total": 18, "data@env_args": "{}" * 200}
     for k, length in enumerate(LENGTHS):
         demo, i = f"data/demo_{k}", np.arange(length)
         for part, plus in (("obs", 0), ("next_obs", 1)):

@@ -90,8 +90,7 @@ def test_features_are_standardised_by_each_sensors_own_images(model: Model, othe
         own = others.sensors[rows] == number
         expected = (features(model, others, "touch", rows[own]) - seen.mean(0)) / seen.std(0)
         np.testing.assert_allclose(found[own], expected, rtol=1e-5, atol=1e-5)
-    unchanged = ("vision", ("features",)), ("touch", ()), ("touch", ("colours",))  # colours: no new sensor here
-    for modality, kinds in unchanged:
+    for modality, kinds in (("vision", ("features",)), ("touch", ()), ("touch", ("colours",))):  # no sensor is new here
         plain = touch_features(model, others, modality, rows, kinds)  # type: ignore[arg-type]
         np.testing.assert_allclose(plain, features(model, others, modality, rows), rtol=1e-5, atol=1e-6)
 
