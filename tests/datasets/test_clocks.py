@@ -91,8 +91,8 @@ def test_nothing_is_extrapolated_and_what_is_left_out_is_counted(tmp_path: Path)
     assert time.min() >= 0.503 and time.max() <= 1.493 and not ((time > 0.893) & (time < 1.093) & (own == "0")).any()
     assert ((time > 0.893) & (time < 1.093) & (own == "1")).sum() == 5
     (note,) = pack.spec.notes
-    said = rf"force\.csv joined by stamp, its largest gap is 0\.21 s; {150 - pack.num} of 150 rows are not .*"
-    assert re.fullmatch(said, note)
+    lost = f"{150 - pack.num} of 150 rows left out: no measurement within .* before and after"
+    assert re.fullmatch(rf"force\.csv joined by stamp, its largest gap is 0\.21 s; {lost}", note)
     time = (wide := packed(root, tmp_path / "w", **LOG, tolerance=0.2)).column("time").astype(float)
     assert ((time > 0.893) & (time < 1.093)).sum() == 15
     assert np.allclose(wide.values(wide.spec.values[0])[:, 0], force(time), atol=1e-6)

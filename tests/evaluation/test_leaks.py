@@ -237,6 +237,17 @@ def test_data_changed_since_training_is_said(pack: Pack, tmp_path: Path, capsys:
     assert "was trained on other data than its probes are fitted on" in capsys.readouterr().err
 
 
+def test_an_export_checked_on_rows_that_its_run_has_seen_says_so(
+    smoke_run: Path, pack: Pack, turned: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = []
+    for checked in (pack, turned):
+        options = ["--on", str(checked.path), "--out", str(tmp_path / checked.path.parent.name)]
+        assert main(["export", str(smoke_run), "--modalities", "touch", *options]) == 0
+        said.append(capsys.readouterr().out)
+    assert "LEAK" not in said[0] and "LEAK: 72 of 72 test rows" in said[1]
+
+
 def test_scores_on_val_are_not_taken_for_those_on_test(pack: Pack, tmp_path: Path) -> None:
     """Both are of one pack, so its digest does not tell them apart: the note does."""
     data = PackConfig(path=pack.path, score_on="val")

@@ -271,7 +271,7 @@ def test_seeds_whose_automatic_precision_differs_are_seeds_of_one_run(pack: Pack
     for seed in (0, 1):
         with pytest.MonkeyPatch.context() as patch:
             found = Hardware(torch.device("cpu"), ("fp32", "bf16")[seed], "")
-            patch.setattr(setup, "_hardware", lambda *_, found=found: found)
+            patch.setattr(setup, "hardware_of", lambda *_, found=found: found)
             paths.append(train(replace(run, seed=seed), tmp_path / f"s{seed}", quiet=True))
     models = [load(path) for path in paths]
     assert [m.run.precision for m in models] == ["fp32", "bf16"] and names_of(paths, models) == ["mvitac", "mvitac"]

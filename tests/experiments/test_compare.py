@@ -228,7 +228,7 @@ def test_changed_fields_are_checked() -> None:
     assert setting("encoder.weights=scratch") == ("encoder.weights", "scratch")
     with pytest.raises(ValueError, match="field=value"):
         setting("steps")
-    assert slug("Calandra et al., supervised") == "calandra-et-al.-supervised"
+    assert slug("Calandra et al., supervised") == "calandra-et-al.-supervised" and slug("../../x") == "x"
 
 
 def test_result_and_tables_agree(done: tuple[Path, dict]) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import timm
@@ -28,6 +29,7 @@ from mvitac.model import load
 from mvitac.nn.encoders import EncoderConfig
 from mvitac.report.tables import print_finetuning
 from mvitac.run import load_run
+from mvitac.system.device import Hardware
 from mvitac.system.files import read_json
 from mvitac.training.loop import train
 from support.toy import Toy, altered, toy_pack
@@ -192,6 +194,7 @@ def test_killed_and_resumed_is_straight(
     ancestor: Path, pack: Pack, tuned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: int
 ) -> None:
     monkeypatch.setattr("mvitac.training.loop.MIN_BETWEEN_CHECKPOINTS", 1)  # also of short runs, after every step
+    monkeypatch.setattr(Hardware, "choose", choose := Mock(wraps=Hardware.choose))
     asked = replace(ASKED, from_scratch=False)
     with power_cut(after), pytest.raises(RuntimeError, match="power cut"):
         tune(ancestor, pack, tmp_path / "out", asked)
@@ -201,6 +204,7 @@ def test_killed_and_resumed_is_straight(
     with pytest.raises(ValueError, match=r"out is not empty: continue it with --resume"):
         tune(ancestor, pack, tmp_path / "out", asked)
     result = tune(ancestor, pack, tmp_path / "out", asked, resume=True)
+    assert [call.args[1] for call in choose.call_args_list].count("auto") == 1  # another choice may differ
     assert_equal_weights(tmp_path / "out" / "seed0", tuned / "seed0")
     straight = [r for r in json.loads((tuned / "scores.json").read_text())["records"] if r["fraction"] == 100]
     for record in result["records"]:

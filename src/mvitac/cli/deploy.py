@@ -73,10 +73,11 @@ def export(argv: list[str]) -> None:
     check_models(options.model)
     check_new(options.out, before_lock=True)
     loading()
-    from mvitac.deploy.artifact import load
+    from mvitac.deploy.artifact import folder_of, load
     from mvitac.deploy.export import export
     from mvitac.deploy.publish import own_data, with_probes
     from mvitac.evaluation.evaluate import as_trained
+    from mvitac.evaluation.leaks import UNKNOWN, Scored, read_sources
     from mvitac.report.tables import text_table
 
     model = load(options.model)
@@ -99,4 +100,10 @@ def export(argv: list[str]) -> None:
     rows += [[f"{name}, lowest cosine", "", f"{values['min']:.5f}"] for name, values in report["cosine"].items()]
     latency = "{p50} / {p99}".format(**report["latency_ms"])
     rows += [["size, MB", "", f"{report['size_mb']}"], ["latency of one pair, ms: p50 / p99", "", latency]]
-    print(text_table(f"{options.out}: checked on {report['num_rows']} rows of {(new or pack).path}", ["", *both], rows))
+    pack = new or pack
+    print(text_table(f"{options.out}: checked on {report['num_rows']} rows of {pack.path}", ["", *both], rows))
+    if options.on or new:
+        tested, others = pack.rows("test"), pack.rows("train", "val", "unlabelled")
+        leak = Scored(pack).leak(read_sources(folder_of(options.model)), tested if len(tested) else others)
+        if leak not in ("", UNKNOWN):
+            print(f"LEAK: {leak}: this table compares the export with the model, it is no score")

@@ -76,7 +76,7 @@ class LeRobotConfig(RecordedConfig):
     ) -> tuple[list[Row], Refs, tuple[str, ...]]:
         """Return the table rows as text, the references of ``embedded`` images, and a note if rows are lacking."""
         tasks, rows, cells = _tasks(self.path, info), list[Row](), Refs()
-        for file in sorted((self.path / "data").glob("*/*.parquet")):
+        for file in sorted((self.path / "data").glob("*/[!.]*.parquet")):
             num = len(rows)
             add_file(file, rows, cells, self.vectors(), embedded)
             for name in sorted(rows[0].keys() - rows[num].keys() if rows[num:] else ()):

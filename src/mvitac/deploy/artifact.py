@@ -55,17 +55,21 @@ def load(path: str | Path, which: models.Which = "last") -> Model:
     """
     if is_encoder(path):
         return open_encoder(str(path))
-    path = named(path) if isinstance(path, str) else path
-    local = Path(path)
-    found = HUB_ID.fullmatch(path) if isinstance(path, str) else None
-    # "runs/frist" beside a folder runs/ is a typing mistake, not a repository.
-    if found and not local.exists() and not local.parent.is_dir():
-        local = pull(found["repo"], found["revision"])
-    elif not (local / ARTIFACT.name).is_file():
+    if not ((local := folder_of(path)) / ARTIFACT.name).is_file():
         return models.load(local, which)
     if which != "last":
         raise ValueError(f"{path} is an artifact, which has one set of weights: leave out {which!r}")
     return read(local)
+
+
+def folder_of(path: str | Path) -> Path:
+    """The folder that ``load`` reads; one on the Hub is fetched."""
+    local = Path(named(path) if isinstance(path, str) else path)
+    found = HUB_ID.fullmatch(path) if isinstance(path, str) else None
+    # "runs/frist" beside a folder runs/ is a typing mistake, not a repository.
+    if found and not local.exists() and not local.parent.is_dir():
+        return pull(found["repo"], found["revision"])
+    return local
 
 
 def pull(repo: str, revision: str | None) -> Path:

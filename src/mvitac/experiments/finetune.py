@@ -39,7 +39,7 @@ from mvitac.run import Optim, Run, load_run
 from mvitac.system.files import check_place, digest, read_json, write_json
 from mvitac.system.progress import duration
 from mvitac.training.loop import Diverged, train
-from mvitac.training.setup import check_same
+from mvitac.training.setup import check_same, hardware_of
 from mvitac.transforms.random_views import Augment, ViewAugment
 
 TUNED, FROZEN, SCRATCH = "fine-tuned", "frozen, linear probe", "from scratch"
@@ -110,7 +110,10 @@ def finetune(
     modalities: Any = asked.modalities or fitting(model, pack, asked.modalities or MODALITIES)
     method = SupervisedConfig(tasks=tuple(task.name for task in tasks), modalities=modalities)
     modality = "both" if len(modalities) == 2 else modalities[0]
-    job = _Job(asked, model, pack, _run_of(model, init, data, pack, method), tasks, modality, out, say, quiet)
+    run = replace(_run_of(model, init, data, pack, method), batch_size=asked.batch_size)
+    begun = min(out.rglob("run.json"), default=None)  # one precision for all: each run would measure it anew
+    run = replace(run, precision=hardware_of(run, pack, begun).precision)
+    job = _Job(asked, model, pack, run, tasks, modality, out, say, quiet)
     for task in tasks:
         job.test(task)
         if isinstance(task, Task):

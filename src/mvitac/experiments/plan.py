@@ -75,7 +75,7 @@ class Plan:
         for name in [name for name in fixed if name in given]:
             raise ValueError(f"{name}: {fixed[name]}")
         folders = [slug(label).encode() for label in labels]
-        possible = all(folder.strip(b".") and len(folder) < 200 for folder in folders)
+        possible = all(folder and len(folder) < 200 for folder in folders)
         if not possible or "*" in "".join(labels):  # of a control
             how = "a label of letters or digits, under 200 bytes, without *"
             raise ValueError(f"plan {self.name!r}: give each row {how}")
@@ -143,7 +143,8 @@ def find_plan(given: str) -> Plan:
 
 
 def slug(label: str) -> str:
-    return "-".join("".join(c if c.isalnum() or c in ".=" else " " for c in label.lower()).split())
+    """A file's name, never a hidden one."""
+    return "-".join("".join(c if c.isalnum() or c in ".=" else " " for c in label.lower()).split()).lstrip(".-")
 
 
 def dotted(changes: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

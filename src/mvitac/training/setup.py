@@ -26,7 +26,7 @@ from mvitac.nn.imagenet import source
 from mvitac.registry import from_json, to_json
 from mvitac.run import Run, load_run, precision_of
 from mvitac.system.device import Hardware, describe, has_bf16, pick_device
-from mvitac.system.distributed import World, local_device
+from mvitac.system.distributed import World, join, local_device
 from mvitac.system.files import brief, check_place, is_temporary, write_json
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.progress import shown
@@ -68,7 +68,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     check_divisible(asked, world)
     check_mix(asked, pack, rows, world)
     resumed = (out / "run.json").exists()
-    hardware = _hardware(asked, pack, device, world, out if resumed else None)
+    hardware = hardware_of(asked, pack, out if resumed else None)
     run = replace(asked, precision=hardware.precision)
     if resumed and _is_finished(asked, pack, out, world):
         return None
@@ -179,15 +179,17 @@ def check_same(run: Run, pack: Pack, out: Path) -> None:
         raise ValueError(f"{out} {DIFFERENT}")
 
 
-def _hardware(run: Run, pack: Pack, device: torch.device, world: World, begun: Path | None) -> Hardware:
-    """The precision of ``run`` on ``device``. A run that was ``begun`` goes on in its own; auto is bf16 if all agree."""
+def hardware_of(run: Run, pack: Pack, begun: Path | None) -> Hardware:
+    """Device and precision of ``run``. A run that was ``begun`` goes on in its own; auto is bf16 if all agree."""
+    device = pick_device(local_device(run.device))
     if run.precision != "auto":
         return Hardware.choose(device, run.precision)
     if begun:
         return Hardware.choose(device, precision_of(*load_run(begun)))
     measured = device.type == "cpu" and has_bf16(device)
     made = Hardware.choose(device, "auto", _trial_pass(run, pack, device) if measured else None)
-    return Hardware.choose(device, "fp32") if world.any(made.precision == "fp32") and made.precision == "bf16" else made
+    slow = join().any(made.precision == "fp32") and made.precision == "bf16"
+    return Hardware.choose(device, "fp32") if slow else made
 
 
 def _trial_pass(run: Run, pack: Pack, device: torch.device) -> Callable[[], None]:

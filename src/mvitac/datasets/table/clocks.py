@@ -136,7 +136,8 @@ def join(
         if twice := names.keys() & set(table.columns):
             raise ValueError(f"{table.path} and {name} both have a column {min(twice)!r}: rename one")
         there = [bool(row) for row in made]
-        lost = f"; {there.count(False)} of {len(there)} rows are not within {tolerance:g} s of it and left out"
+        sides = " before and after" * any(name in smooth for name in names)
+        lost = f"; {there.count(False)} of {len(there)} rows left out: no measurement within {tolerance:g} s{sides}"
         note = f"{name} joined by {text.removeprefix(f'{name}:')}, its largest gap is {gap:.3g} s"
         note += lost * (not all(there))
         note += f"; {same} of its rows have the stamp of another, of which one counts" * bool(same)
