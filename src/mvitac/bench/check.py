@@ -151,10 +151,10 @@ def problems_of(encoder: dict[str, Any], controls: Sequence[str]) -> Iterator[st
 def _of_block(
     block: dict[str, Any], suite: Suite, one: SuiteSet, ask: SuiteTask, encoder: dict[str, Any]
 ) -> Iterator[str]:
-    records = block["records"]
-    if block["form"] not in [form.name for form in one.forms]:
+    records, forms = block["records"], [form for form in one.forms if form.name == block["form"]]
+    if not forms:
         yield f"the suite has no form {block['form']!r}"
-    elif pinned_of(suite, block) == "other rows" and any(f.at for f in one.forms if f.name == block["form"]):
+    elif pinned_of(suite, block) == "other rows" and any(form.at for form in forms):
         yield "the data has other rows, labels or splits than the suite"
     if len(block["leaks"]) != len(encoder["seeds"]):
         yield f"has {len(block['leaks'])} leak marks for {len(encoder['seeds'])} seeds"
@@ -169,8 +169,8 @@ def _of_block(
         yield f"the encoder has the name of a control, {encoder['name']!r}: give --name"
     have = Counter((r["source"], r["modality"], r["probe"], r["seed"]) for r in records)
     want = _expected(suite, ask, block, encoder["seeds"], "targets" in records[0] if records else False)
-    asked = [text for form in one.forms if form.name == block["form"] for text in form.data.get("controls", ())]
-    made = [spec for form in one.forms if form.name == block["form"] and (spec := simulated_spec(form))]
+    asked = [text for form in forms for text in form.data.get("controls", ())]
+    made = [spec for form in forms if (spec := simulated_spec(form))]
     asked += [name for spec in made for name in spec.controls]
     want |= {((text.rpartition("=")[0] or text).strip(), "none", "linear", None) for text in asked}
     own = {key for key in have if key[1:] == ("none", "linear", None) and key[0] not in CONTROLS}  # columns of the data
@@ -188,8 +188,7 @@ def _of_block(
         if rows.setdefault(record["modality"], scored) != scored:
             yield f"{what}: is scored on other rows than those above it"
     yield from _copies([record for record in records if "targets" in record])
-    forms = [form.data for form in one.forms if form.name == block["form"]]
-    tasks = [value_task(text) for data in forms for text in data.get("values", ())]
+    tasks = [value_task(text) for form in forms for text in form.data.get("values", ())]
     for task in (*tasks, *(task for spec in made for task in spec.values)):
         named, given = [[target.name, target.unit] for target in task.targets], [r.get("targets") for r in records[:1]]
         if task.name == block["task"] and given and given != [named]:
