@@ -66,11 +66,10 @@ class Board:
     def encoders(self) -> list[str]:
         """Names of encoders by their mean rank over the rows that all of them have, the best one first."""
         common = [row for row in self.rows if all(name in row.cells for name in self.results)]
-        ranks = dict.fromkeys(self.results, 0.0)
-        for row in common:
-            each = rankdata([-row.cells[name]["mean"] for name in self.results])  # equals share their mean rank
-            ranks = {name: ranks[name] + rank for name, rank in zip(ranks, each, strict=True)}
-        return sorted(self.results, key=lambda name: (ranks[name], name))
+        # Equals share their mean rank.
+        ranks = [rankdata([-row.cells[name]["mean"] for name in self.results]) for row in common]
+        total = sum(ranks, np.zeros(len(self.results)))
+        return [name for _, name in sorted(zip(total, self.results, strict=True))]
 
 
 def write_board(files: Sequence[Path], out: Path) -> Path:
