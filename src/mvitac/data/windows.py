@@ -34,10 +34,8 @@ def windowed(pack: Pack, window: Window) -> Pack:
         return made
     check_known("modality of windows", window.of, pack.spec.modalities)
     index, whole, first = frames_of(pack, window)
-    kept: dict[str, list[str]] = {}
-    for name in pack.spec.split_columns if window.short == "leave-out" else ():
-        kept[name] = [split if full else "hidden" for split, full in zip(pack.column(name), whole, strict=True)]
-    made = pack.with_splits(kept)
+    columns = pack.spec.split_columns if window.short == "leave-out" else ()
+    made = pack.with_splits({name: np.where(whole, pack.column(name).astype(str), "hidden") for name in columns})
     made.spec = replace(pack.spec, window=replace(window, order=places(pack, window)[0]))
     kind = [window.frames, float(window.stride), *window.of, window.minus_first, made.spec.window.order, window.short]
     made.digests = {**pack.digests, "window": digest(kind)}
