@@ -26,15 +26,14 @@ ABOUT = b"mvitac-embeddings"  # entry of the file's metadata: JSON
 
 def embed(model: Model, pack: Pack, file: Path, *, shared: bool = False) -> pa.Table:
     """Write the embeddings of a pack: features, or unit vectors of the ``shared`` space."""
-    rows = np.arange(pack.num)
     names = ["id", "group", "split", *(f"label_{task.name}" for task in pack.spec.tasks)]
-    table = pack.table.select(names).append_column("row", pa.array(rows, pa.int64()))
+    table = pack.table.select(names).append_column("row", pa.array(range(pack.num), pa.int64()))
     for modality in fitting(model, pack, in_use=True):  # a query's image is in use
-        have = pack.has(modality)[rows]
-        x = features(model, pack, modality, rows[have], for_heads=shared)
+        have = pack.has(modality)
+        x = features(model, pack, modality, np.flatnonzero(have), for_heads=shared)
         if shared:
             x = model.project(modality, torch.from_numpy(x).to(next(model.parameters()).device)).cpu().numpy()
-        whole = np.full((len(rows), x.shape[1]), np.nan, np.float32)
+        whole = np.full((pack.num, x.shape[1]), np.nan, np.float32)
         whole[have] = x
         table = table.append_column(modality, pa.FixedSizeListArray.from_arrays(whole.reshape(-1), x.shape[1]))
     classes = {task.name: list(task.classes) for task in pack.spec.tasks}
