@@ -4,6 +4,7 @@ A task's summary is modality -> method or control -> cell (``scores.summarise``)
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -55,11 +56,9 @@ def clipped_text(task: dict[str, Any]) -> str:
 
 def covered(group_by: str, records: Sequence[dict[str, Any]]) -> str:
     """What the 95 % intervals of ``records`` cover (``interval``)."""
-    seeds: dict[str, set[int]] = {}
-    for record in records:
-        if record["seed"] is not None:
-            seeds.setdefault(record["source"], set()).add(record["seed"])
-    if not (single := [source for source, found in seeds.items() if len(found) == 1]):
+    pairs = dict.fromkeys((record["source"], record["seed"]) for record in records if record["seed"] is not None)
+    seeds = Counter(source for source, _ in pairs)
+    if not (single := [source for source, num in seeds.items() if num == 1]):
         return f"over test {group_by}s and seeds"
     if len(single) == len(seeds):
         return f"over test {group_by}s only, for this one seed: they leave out the variation between seeds"
