@@ -87,11 +87,10 @@ def compare(argv: list[str]) -> None:
     given = [setting(text) for text in options.set]
     if twice := [name for i, (name, _) in enumerate(given) if name in dict(given[:i])]:
         raise ValueError(f"--set {twice[0]} is given twice: give it once")
-    changes = {**plan.set, **dict(given)}
     plan = plan.only(options.rows)
     if "--recipe" in chosen and all(row.recipe for row in plan.rows):
         raise ValueError(f"--recipe {recipe} has no effect: every row of {plan.name} has its own")
-    plan = replace(plan, recipe=recipe, set=changes, **same)
+    plan = replace(plan, recipe=recipe, set={**plan.set, **dict(given)}, **same)
     config = ProbeConfig(probes=plan.probes, tasks=plan.tasks, modalities=plan.modalities)
     if options.dry_run and options.tables_only:
         raise ValueError("--tables-only has no effect beside --dry-run: leave one out")

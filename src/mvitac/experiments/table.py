@@ -76,10 +76,9 @@ def as_printed(result: dict[str, Any], plan: Plan) -> bool:
 def _printed(result: dict[str, Any], plan: Plan, task: str, modality: str, source: str) -> float | None:
     """The paper's number, if it has one for this split, of positives from the same image."""
     label = source.removesuffix(END_TO_END)
-    pairs = {cost["row"]: cost["pairs_of"] for cost in result["cost"]}
+    one_row = {cost["row"] for cost in result["cost"] if cost["pairs_of"] == ONE_ROW}
     if source == "majority":
         printed = plan.printed_majority
     else:
-        printed = {row.label: row.printed for row in plan.rows}.get(label, {}).get(modality, {})
-        printed = printed if pairs.get(label) == ONE_ROW else {}
+        printed = {row.label: row.printed for row in plan.rows if row.label in one_row}.get(label, {}).get(modality, {})
     return printed[task] / 100 if as_printed(result, plan) and task in printed else None
