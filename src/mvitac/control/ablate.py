@@ -269,8 +269,7 @@ def ablate(policy: Policy, episodes: Episodes) -> dict[str, Any]:
         if episodes.actions is None:  # also where they are of another policy
             episodes.images, episodes.rows = {sense: np.stack(images) for sense, images in seen.items()}, steps
         wanted = normal if episodes.actions is None else episodes.actions
-        still = np.nanmax(wanted, axis=0) == np.nanmin(wanted, axis=0)
-        scale = np.where(still, np.inf, np.nanstd(wanted, axis=0))
+        scale = np.where(np.nanmax(wanted, axis=0) == np.nanmin(wanted, axis=0), np.inf, np.nanstd(wanted, axis=0))
         kept = [each[np.isfinite(wanted[each]).all(1)] for each in steps]
         parts = _parts(episodes.touched, kept)
         if episodes.actions is not None:
@@ -290,9 +289,7 @@ def ablate(policy: Policy, episodes: Episodes) -> dict[str, Any]:
         again, *_ = act(policy, episodes)  # last: what a policy keeps adds up
     if again.shape != normal.shape or away(again, normal, scale).max() > SAME:
         raise ValueError("the policy acts differently on the same episodes: give it reset(), and seed what it draws")
-    found = {
-        sense: verdict(sense, [row for row in rows if row["sense"] == sense], len(kept)) for sense in episodes.senses
-    }
+    found = {s: verdict(s, [row for row in rows if row["sense"] == s], len(kept)) for s in episodes.senses}
     error = np.maximum(_paired(own, kept, level=True)[:3], 0).tolist()
     if episodes.unit == "failures":  # 0 or 1 of each episode
         error = list(interval([{"group_sizes": [1] * len(kept), "group_correct": [own[each[0]] for each in kept]}]))

@@ -37,11 +37,9 @@ def film(episodes: Episodes, runs: Sequence[Run]) -> list[Image.Image]:
     return pictures
 
 
-def _trace(
-    picture: Image.Image, at: tuple[int, int], title: str, errors: np.ndarray, step: int, most: np.ndarray
-) -> None:
-    draw = ImageDraw.Draw(picture)
-    draw.text((at[0] + 6, at[1] + 2), title, "black")
+def _trace(image: Image.Image, at: tuple[int, int], name: str, errors: np.ndarray, step: int, most: np.ndarray) -> None:
+    draw = ImageDraw.Draw(image)
+    draw.text((at[0] + 6, at[1] + 2), name, "black")
     for line, (unit, colour) in enumerate((("mm", "#0072b2"), ("°", "#d55e00"))):
         draw.text((at[0] + 6 + 60 * line, at[1] + 14), f"{errors[step, line]:.1f} {unit}", colour)
         y = at[1] + SIDE - 6 - (SIDE - 40) * errors[: step + 1, line] / most[line]

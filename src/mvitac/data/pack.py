@@ -122,16 +122,14 @@ class Pack:
         names = [target.name for target in task.targets]
         return self._known(task, splits, lambda: np.stack([self.column(n).astype(float) for n in names], 1), np.nan)
 
-    def _known(
-        self, task: AnyTask, splits: tuple[str, ...], read: Callable[[], np.ndarray], nothing: float
-    ) -> np.ndarray:
-        """What ``read`` returns, with ``nothing`` in rows that are not of the task or not in ``splits``, if any."""
+    def _known(self, task: AnyTask, splits: tuple[str, ...], read: Callable[[], np.ndarray], fill: float) -> np.ndarray:
+        """What ``read`` returns, with ``fill`` in rows that are not of the task or not in ``splits``, if any."""
         if (key := (repr(task), *splits)) not in self._answers:
             known = read()
             for name, value in task.only.items():
-                known[self.column(name).astype(str) != value] = nothing
+                known[self.column(name).astype(str) != value] = fill
             if splits:
-                known[~np.isin(self.column(task.split), splits)] = nothing
+                known[~np.isin(self.column(task.split), splits)] = fill
             self._answers[key] = known
         return self._answers[key].copy()  # callers may change it
 

@@ -99,14 +99,12 @@ def table_of(columns: Sequence[dict[str, Any]]) -> pa.Table:
     return pa.table(arrays)
 
 
-def read_parts(
-    reader: Reader, parts: Sequence[tuple[int, int]], workers: int
-) -> Iterator[tuple[Part, dict[str, bytes]]]:
+def read_parts(read: Reader, parts: Sequence[tuple[int, int]], workers: int) -> Iterator[tuple[Part, dict[str, bytes]]]:
     """Yield the parts (first item, end), in order, read by ``workers`` processes; 0 = one per core."""
     workers = workers or os.cpu_count() or 1
     if workers == 1 or len(parts) < 2:
         keep_freed_memory()
-        yield from (reader(*part) for part in parts)
+        yield from (read(*part) for part in parts)
         return
     ahead: deque[Future[tuple[Part, dict[str, bytes]]]] = deque()
     # spawn: a forked child may inherit locks held by torch. Starting a worker is cheap, because it does not import torch.
@@ -116,7 +114,7 @@ def read_parts(
     ):
         # In a file: the pipe to a new process is blocked for ever if that process ends before it has read all.
         with naming(Path(file.name)):
-            file.write(pickle.dumps(reader))
+            file.write(pickle.dumps(read))
             file.flush()
         try:
             for part in parts:

@@ -263,8 +263,6 @@ class Live:
         """Counts, ages in ms from capture to prediction, and events, JSON-ready."""
         p50, p99 = (1000 * float(np.percentile(self.ages, q)) if self.ages else None for q in (50, 99))
         ages = {"p50": p50, "p99": p99, "max": 1000 * self.max_age if self.ages else None}
-        streams = {
-            s.name: {"frames": s.num_frames, "dropped": s.num_dropped, "damaged": s.num_damaged} for s in self.all
-        }
+        found = {s.name: {"frames": s.num_frames, "dropped": s.num_dropped, "damaged": s.num_damaged} for s in self.all}
         known = {"predictions": self.num_predictions, "touches": self.num_touches, "age_ms": ages}
-        return {**known, "stale": self.num_stale, "streams": streams, "events": dict(self.counts)}
+        return {**known, "stale": self.num_stale, "streams": found, "events": dict(self.counts)}

@@ -67,12 +67,10 @@ def folder_stamp(path: str) -> Stamp:
     return sum(size for size, _ in found), max((time for _, time in found), default=0)
 
 
-def check_present(
-    table: Manifest, by_modality: Mapping[str, Sequence[str]], allow_missing: bool
-) -> dict[str, list[bool]]:
+def check_present(table: Manifest, asked: Mapping[str, Sequence[str]], allow_missing: bool) -> dict[str, list[bool]]:
     """Return, for each modality that some rows lack, which rows lack it; ValueError unless ``allow_missing``."""
     missing: dict[str, list[bool]] = {}
-    for modality, columns in by_modality.items():
+    for modality, columns in asked.items():
         gaps = [[table.images[c][i] is None for c in columns] for i in range(len(table.rows))]
         for i, gap in enumerate(gaps):
             if any(gap) and not (allow_missing and all(gap)):
@@ -83,7 +81,7 @@ def check_present(
             raise ValueError(f"{table.path}: {modality} is empty in every row: leave it out by --data.{modality} ''")
         if any(lacking):
             missing[modality] = lacking
-    present = [m for m, columns in by_modality.items() if columns]
+    present = [m for m, columns in asked.items() if columns]
     for i in range(len(table.rows)):
         if missing and all(m in missing and missing[m][i] for m in present):
             raise ValueError(f"{table.at(i)} has neither image: leave it out (--data.only)")
