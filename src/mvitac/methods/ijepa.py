@@ -127,9 +127,8 @@ class IJEPA(Contrastive, config=IJEPAConfig):
         self.config = config
         self.trunks = vit.build_vits(encoder, spec, config.name)
         self.teachers = nn.ModuleDict({m: Momentum(vit.vit_of(trunk)) for m, trunk in self.trunks.items()})
-        self.predictors = nn.ModuleDict()
-        for modality, trunk in self.trunks.items():
-            self.predictors[modality] = vit.Predictor(trunk, vit.vit_of(trunk).embed_dim, 1 / 2, (384, 12))
+        predictors = {m: vit.Predictor(t, vit.vit_of(t).embed_dim, 1 / 2, (384, 12)) for m, t in self.trunks.items()}
+        self.predictors = nn.ModuleDict(predictors)
 
     def blocks(self, batch: Views, modality: str) -> Blocks:
         """The blocks of each image that the ViT of ``modality`` sees."""
@@ -153,8 +152,7 @@ class IJEPA(Contrastive, config=IJEPAConfig):
         for modality in self.trunks:
             blocks = self.blocks(batch, modality)
             teacher: VisionTransformer = self.teachers[modality].module  # type: ignore[assignment]
-            tokens = teacher.forward_features(batch.images[modality][0])
-            tokens = tokens[:, teacher.num_prefix_tokens :]
+            tokens = teacher.forward_features(batch.images[modality][0])[:, teacher.num_prefix_tokens :]
             target = vit.take(F.layer_norm(tokens.float(), tokens.shape[-1:]), blocks.targets.flatten(1))
             used = blocks.in_target.flatten(1).float()
             result["target", modality] = target
