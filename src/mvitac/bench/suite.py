@@ -175,8 +175,7 @@ class Opened:
     def beside(self) -> str:
         """Digest of what scores and controls depend on, too, and ``digests`` have not: the data's controls, touches."""
         pack = self.packs[0]
-        controls = pack.spec.controls.items()
-        used = {name: [pack.column(c).astype(str).tolist() for c in columns] for name, columns in controls}
+        used = {n: [pack.column(c).astype(str).tolist() for c in columns] for n, columns in pack.spec.controls.items()}
         return digest([used, pack.touch_groups.tolist()])
 
 

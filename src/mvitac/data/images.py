@@ -19,8 +19,7 @@ def fit(image: np.ndarray, size: int) -> np.ndarray:
     # One element of three bytes per pixel and sensor: copies ten times as fast as single bytes.
     pixels = np.ascontiguousarray(image).view("V3")
     sensors = [np.ascontiguousarray(pixels[:, :, i]).view(np.uint8) for i in range(pixels.shape[2])]
-    shaped = [s.reshape(*image.shape[:2], 3) for s in sensors]
-    return np.concatenate([shrink(Image.fromarray(s), size) for s in shaped], axis=2)
+    return np.concatenate([shrink(Image.fromarray(s.reshape(*image.shape[:2], 3)), size) for s in sensors], axis=2)
 
 
 def shrink(image: Image.Image, size: int) -> np.ndarray:

@@ -24,9 +24,8 @@ def encode(image: np.ndarray, quality: int) -> bytes:
     """Encode uint8 [S, S, C] as JPEG, 4:4:4: a gel shows slopes by colour. Other builds of libjpeg may differ."""
     if not image.any():
         return b""
-    size = len(image)
     buffer = io.BytesIO()
-    sensors = image.reshape(size, size, -1, 3).transpose(2, 0, 1, 3).reshape(-1, size, 3)
+    sensors = image.reshape(*image.shape[:2], -1, 3).transpose(2, 0, 1, 3).reshape(-1, len(image), 3)
     Image.fromarray(sensors).save(buffer, "JPEG", quality=quality, subsampling=0)
     return buffer.getvalue()
 

@@ -65,9 +65,8 @@ class MixedPack(_Several):
         self.path, self.meta = Path(" + ".join(str(pack.path) for pack in packs)), {}
         self.size = size or max(pack.size for pack in packs)
         self.digests = {name: pack.digest for name, pack in parts.items()} | {"size": digest(self.size)}
-        other = {name: pack.size for name, pack in parts.items() if pack.size != self.size}
         how = f"px are resized to {self.size} px as they are read"
-        notes = [f"{name}: images of {px} {how}" for name, px in other.items()]
+        notes = [f"{name}: images of {pack.size} {how}" for name, pack in parts.items() if pack.size != self.size]
         if found := _shared_by_parts(parts):
             if not allow_leak:
                 raise ValueError(f"{found}: pack them with equal splits, leave a part out, or give --data.allow-leak")

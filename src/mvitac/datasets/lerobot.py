@@ -150,7 +150,6 @@ class LeRobotConfig(RecordedConfig):
 def choose(cameras: Sequence[str], vision: str | None, touch: tuple[str, ...], where: Path) -> dict[str, str]:
     """Return column -> camera key: requested keys by their own name, guessed ones as vision, touch, left and right."""
     felt = [key for key in cameras if FELT.search(key) and key != vision]
-    seen = [key for key in cameras if key not in felt]
     for key in (*touch, vision):
         if key and key not in cameras:
             raise ValueError(f"{where}: {unknown('camera', key, cameras)}")
@@ -161,7 +160,7 @@ def choose(cameras: Sequence[str], vision: str | None, touch: tuple[str, ...], w
         names = dict(zip(("touch",) if len(felt) == 1 else ("left", "right"), felt, strict=True))
     if vision:
         names[vision] = vision
-    elif vision is None and (left := [key for key in seen if key not in touch]):
+    elif vision is None and (left := [key for key in cameras if key not in (*felt, *touch)]):
         names["vision"] = left[0]
     if not names:
         raise ValueError(f"{where} has no cameras to choose from: features of dtype video or image are needed")

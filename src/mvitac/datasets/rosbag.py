@@ -62,14 +62,13 @@ class RosbagConfig(RecordedConfig):
         if not bags:
             raise ValueError(f"{path} is no bag and holds none: give a folder with metadata.yaml, a .bag, or several")
         cameras = [topic for topic in (*self.touch, self.vision) if topic]
-        named = *self.labels, *self.numbers(), *self.conditioned()
-        named = *named, self.group, self.touch_group, self.split, self.sensor
+        used = *self.labels, *self.numbers(), *self.conditioned(), self.group, self.touch_group, self.split, self.sensor
         smooth, every = self.smooth(), self.every or 1
         rows: list[Row] = []
         images: Refs = {topic: [] for topic in cameras}
         dropped, same = 0, Counter[str]()
         for bag in bags:
-            seen = _read(bag, cameras, [name for name in dict.fromkeys(named) if name])
+            seen = _read(bag, cameras, [name for name in dict.fromkeys(used) if name])
             if not len(own := seen[cameras[0]][0][::every]):
                 raise ValueError(f"{bag} has no image of {cameras[0]}: is it complete?")
             good = np.ones(len(own), bool)

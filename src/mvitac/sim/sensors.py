@@ -148,10 +148,9 @@ def _random_sensor(seed: int, number: int) -> Sensor:
         return rng.uniform(max(low - extra, 0.0) if low >= 0 else low - extra, high + extra, size)
 
     base = within((level for s in known for level in s.base), 3)
-    spots = np.array([spot for s in known for spot in s.glow])
     # A dark channel has a high spot: the level at the centre varies much less than either.
     height = within((b + spot[0] for s in known for b, spot in zip(s.base, s.glow, strict=True)), 3) - base
-    place = [within(column, 3) for column in spots.T[1:]]
+    place = [within(column, 3) for column in np.array([spot for s in known for spot in s.glow]).T[1:]]
     tilt = np.stack([within((pair[axis] for s in known for pair in s.tilt), 3) for axis in (0, 1)], axis=1)
     strength = within((float(np.hypot(*pair)) for s in known for pair in s.response), 3)
     spread = np.arange(3) * 2 * np.pi / 3 + rng.uniform(-0.4, 0.4, 3)

@@ -144,9 +144,8 @@ class TouchAndGo(Source):
             if frame.number in lost:
                 samples.append(Lost(f"{frame.recording}/{frame.number:010d}", lost[frame.number]))
             else:
-                own = {modality: found[frame.number] for modality, found in images.items()}
-                columns = _columns(frame, self._spec)
-                samples.append(Sample(vision=own.get("vision"), touch=own.get("touch"), columns=columns))
+                vision, touch = (images[m][frame.number] if m in images else None for m in MODALITIES)
+                samples.append(Sample(vision=vision, touch=touch, columns=_columns(frame, self._spec)))
         return samples
 
 
