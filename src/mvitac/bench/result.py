@@ -85,8 +85,7 @@ def read_signed(path: Path, form: tuple[str, int] = FORM) -> dict[str, Any]:
         raise ValueError(f"{path} is not a result of the bench: give a file that `mvitac bench MODEL` wrote")
     if value.get("format_version") != form[1]:
         raise ValueError(f"{path} has format {value.get('format_version')}, this version reads {form[1]}")
-    given = digest({key: part for key, part in value.items() if key not in VOLATILE})
-    if value.get("digest") != given:
+    if value.get("digest") != digest({key: part for key, part in value.items() if key not in VOLATILE}):
         raise ValueError(f"{path} does not match its digest: it was changed after it was written, run the bench again")
     return value
 

@@ -78,9 +78,8 @@ def trained(model: Model, steps: int) -> Learn:
             schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=steps)
             for _ in range(steps):
                 rows = torch.randint(len(y), (64,)).numpy()
-                loss = nn.functional.smooth_l1_loss(head(features(lambda m, rows=rows: images[m][rows])), y[rows])
                 optimiser.zero_grad()
-                loss.backward()
+                nn.functional.smooth_l1_loss(head(features(lambda m, rows=rows: images[m][rows])), y[rows]).backward()
                 optimiser.step()
                 schedule.step()
         trunks.eval()

@@ -60,8 +60,7 @@ def _each_sensor(pack: Pack) -> np.ndarray:
 
 def shown(pack: Pack, rows: np.ndarray) -> list[np.ndarray]:
     """By ``IMAGES``, the rows [n, F] whose images ``rows`` [n] show: those of windows show earlier frames, too."""
-    own = np.arange(pack.num)[:, None]
-    return [getattr(pack.images.get(modality), "index", own)[rows] for modality, _ in IMAGES]
+    return [getattr(pack.images.get(m), "index", np.arange(pack.num)[:, None])[rows] for m, _ in IMAGES]
 
 
 def known_images(pack: Pack, rows: np.ndarray, known: np.ndarray) -> np.ndarray:

@@ -49,8 +49,7 @@ class ObservationEncoder(nn.Module):
         self.encoders = nn.ModuleDict({m: copy.deepcopy(model.encoders[m]) for m in self.keys})
         self.stored, self.state, self.tune, self._input = model.stored, state, tune, model.input
         self._checked: set[str] = set()
-        self.encoders.requires_grad_(tune)
-        self.encoders.eval()
+        self.encoders.requires_grad_(tune).eval()
         self.out_features = sum(map(num_features, self.encoders.values())) + state
 
     def train(self, mode: bool = True) -> "ObservationEncoder":

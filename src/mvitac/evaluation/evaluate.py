@@ -311,8 +311,7 @@ def check_unseen(
 def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[AnyTask], list[str]]:
     """The tasks and modalities that ``session`` asks for; ValueError if the data lacks one."""
     if not (known := {task.name: task for task in pack.spec.all_tasks}):
-        what = f"dataset {pack.spec.name!r} has no labels and no values"
-        raise ValueError(f"{what}: pack it with --labels or --values")
+        raise ValueError(f"dataset {pack.spec.name!r} has no labels and no values: pack it with --labels or --values")
     check_known("task", session.tasks, known)
     have = [*pack.spec.modalities, *["both"] * (len(pack.spec.modalities) == 2)]
     check_known("modality", session.modalities, have)

@@ -27,10 +27,9 @@ def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_clas
     auroc = float(roc_auc_score(y, probabilities[:, 1])) if num_classes == len(present) == 2 else None
     whole = {"accuracy": float((guess == y).mean()), "balanced_accuracy": float(recall), "macro_f1": float(f1)}
     whole |= {"auroc": auroc, "confusion": confusion_matrix(y, guess, labels=range(num_classes)).tolist()}
-    class_groups = [len(np.unique(groups[y == k])) for k in range(num_classes)]
     correct = np.bincount(groups, weights=guess == y).astype(int).tolist()
     by_group = {"num_test": len(y), "group_sizes": np.bincount(groups).tolist(), "group_correct": correct}
-    return {**whole, "class_groups": class_groups, **by_group}
+    return {**whole, "class_groups": [len(np.unique(groups[y == k])) for k in range(num_classes)], **by_group}
 
 
 def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:

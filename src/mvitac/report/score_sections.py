@@ -39,8 +39,7 @@ def probe(study: Study) -> list[Markup]:
     names = " or ".join(dict.fromkeys(tables.probe_name(kinds[0], score_name(found)) for found in summary.values()))
     by = study.pack.spec.group_by
     intro = f"A probe ({names}) on frozen features, scored on {tables.unseen_groups(by, records)}."
-    for leak in study.result.get("leaks", ()):
-        intro += f" LEAK: {leak}."
+    intro += "".join(f" LEAK: {leak}." for leak in study.result.get("leaks", ()))
     if any(score_name(found) == "R2" for found in summary.values()):
         intro += (
             " Values are scored by R2, the share of the variance of the test rows that is predicted: 100 % is exact, 0 %"

@@ -43,8 +43,7 @@ class View:
         flat = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation)
         self.position = self.target + distance * np.array([*flat, np.sin(elevation)])  # of the camera
         angle = azimuth + rng.uniform(-1.6, 1.6)
-        lamp = np.array([np.cos(angle), np.sin(angle), rng.uniform(0.7, 1.8)])
-        self.lamp = lamp * rng.uniform(0.6, 1.0)  # its position
+        self.lamp = np.array([np.cos(angle), np.sin(angle), rng.uniform(0.7, 1.8)]) * rng.uniform(0.6, 1.0)  # position
         self.clutter_poses = _clutter(azimuth, rng)
         tint = rng.normal(1, 0.10, 3)
         self.roll = rng.normal(0, np.deg2rad(1.5))

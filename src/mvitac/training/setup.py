@@ -117,8 +117,7 @@ def _record(setup: Setup, asked: Run, out: Path, start: Start | None, taken: dic
             raise ValueError(f"{out} {DIFFERENT}")
     else:
         record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(setup.spec)}
-        record |= {leaks.LEARNED: learned}
-        record |= {"device": describe(setup.hardware.device), "precision": run.precision}
+        record |= {leaks.LEARNED: learned, "device": describe(setup.hardware.device), "precision": run.precision}
         record["bf16_slowdown"], said = setup.hardware.slowdown, []
         if used := [m for m in setup.method.encoders() if run.encoder[m].weights == IMAGENET]:
             record["imagenet"] = {m: source(run.encoder[m].trunk) for m in used}

@@ -52,8 +52,7 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         pairs, base = _near_pairs(residuals, asked, bank, groups, one.exact)
         rate = len(pairs) / len(asked)
         repeat = "of the held-out rows that are clear enough to compare nearly repeat one of train"
-        natural = f"({100 * base:.1f} % between groups of train)"
-        notes.append(f"{name}: {share(len(pairs), len(asked))} {repeat} {natural}")
+        notes.append(f"{name}: {share(len(pairs), len(asked))} {repeat} ({100 * base:.1f} % between groups of train)")
         suspicious |= rate > 0.01 or (len(pairs) >= 3 and rate > 3 * base)
         rows += pairs.ravel().tolist()
     item, evidence = "near-copies across splits", "; ".join(notes)
