@@ -100,7 +100,7 @@ def test_nothing_is_extrapolated_and_what_is_left_out_is_counted(tmp_path: Path)
 
 def test_a_clock_that_is_off_is_named_and_set_right(tmp_path: Path) -> None:
     root = recorded(tmp_path / "set", shift=START)
-    with pytest.raises(ValueError, match=r"force\.csv has no time of the images, 0\.000 to 1\.960 s, but 16999"):
+    with pytest.raises(ValueError, match=r"force\.csv has no time within 0\.02 s .*, 0\.000 to 1\.960 s, but 16999"):
         packed(root, tmp_path / "no", **LOG)
     pack = packed(root, tmp_path / "p", **{**LOG, "log": (f"force.csv:stamp-{START:.0f}",)})
     assert np.allclose(pack.values(pack.spec.values[0])[:, 0], force(pack.column("time").astype(float)), atol=1e-4)

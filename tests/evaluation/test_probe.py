@@ -23,7 +23,7 @@ from mvitac.evaluation.controls import controls_of, frozen_trunks, imagenet_trun
 from mvitac.evaluation.diagnostics import linear_probe
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import _folded
-from mvitac.evaluation.few_labels import few
+from mvitac.evaluation.few_labels import few, raised
 from mvitac.evaluation.folds import fold_splits
 from mvitac.evaluation.leaks import read_sources
 from mvitac.evaluation.probe import probe_all, probe_features, probe_model, split_rows
@@ -298,6 +298,8 @@ def test_each_share_has_its_rows_and_one_of_each_class(pack: Pack) -> None:
         assert set(labels[rows.train[train]]) == set(labels[rows.val[val]]) == {0, 1, 2}
         assert len(set(train)) == len(train) == max(3, round(percent / 100 * len(rows.train)))
     assert not np.array_equal(few(pack, task, rows.train, rows.val, 10, seed=4)[0], drawn[10][0])
+    said = f"pattern: 1 % of labels is 6 of {len(rows.train) + len(rows.val)} rows: each class or kind keeps one"
+    assert raised(pack, task, rows.train, rows.val, (1, 50)) == [said]
 
 
 def test_few_values_keep_two_of_each_target(measured: Pack) -> None:
@@ -326,8 +328,9 @@ def test_a_control_of_values_sees_as_few_labels(measured: Pack) -> None:
 
 def test_the_command_shows_few_labels(smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = ["--tasks", "pattern", "--modalities", "touch", "--json", str(tmp_path / "scores.json")]
-    assert main(["probe", str(smoke_run), *asked, "--fractions", "10", "50"]) == 0
+    assert main(["probe", str(smoke_run), *asked, "--fractions", "1", "10", "50"]) == 0
     assert "(10 % of labels;" in (said := capsys.readouterr().out) and "(50 % of labels;" in said
+    assert "note: pattern: 1 % of labels is 6 of" in said
     records = {(r["source"], r["probe"]): r for r in read_json(tmp_path / "scores.json", "")["records"]}
     for source in ("mvitac", "untrained"):
         sizes = {str(records[source, kind]["group_sizes"]) for kind in ("linear", "10 % of labels", "50 % of labels")}

@@ -445,7 +445,7 @@ def test_a_recording_that_was_moved_away_ends(tmp_path: Path) -> None:
         if i == 100:
             recorder.spool.rename(tmp_path / "moved")
         recorder({"touch": image}, {"time": float(i), "contact": True, "touch_number": 1})
-    assert said == [f"recording stopped, prediction goes on: {recorder.spool}: it was deleted or moved"]
+    assert said == [f"recording stopped, prediction goes on: {recorder.spool}: No such file or directory"]
     with pytest.raises(ValueError, match="put it back where it was, and finish it by"):
         recorder.close()
     (tmp_path / "moved").rename(recorder.spool)

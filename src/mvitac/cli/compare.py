@@ -42,7 +42,7 @@ class _Options:
     """auto, cpu, cuda or cuda:N. The same command given again meanwhile, on another GPU or on a machine that shares the
     folder, takes the runs that no process has."""
     dry_run: bool = False
-    """Print the plan, what is finished and what is left, and stop."""
+    """Print the plan, what is finished and what is left, and stop. It opens the data, which may have to be packed."""
     tables_only: bool = False
     """Make the tables of what is finished and train nothing."""
 

@@ -44,8 +44,7 @@ def borders(pack: Pack, modality: str, rows: np.ndarray, side: int = 16, width: 
     """Control "border": the outer ring of a side x side thumbnail, where contact is rarely visible."""
     ring = np.ones((side, side), bool)
     ring[width:-width, width:-width] = False
-    pixels = thumbnails(pack, modality, rows, side).reshape(len(rows), -1, side, side)
-    return pixels[:, :, ring].reshape(len(rows), -1)
+    return thumbnails(pack, modality, rows, side).reshape(len(rows), -1, side, side)[:, :, ring].reshape(len(rows), -1)
 
 
 def controls_of(

@@ -15,6 +15,7 @@ from mvitac.data.several import JoinedPack
 from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
+from mvitac.evaluation import few_labels
 from mvitac.evaluation.controls import CONTROLS, Records, controls_of, frozen_trunks
 from mvitac.evaluation.encoders import Bound, open_encoders, probe_encoders
 from mvitac.evaluation.features import fitting
@@ -98,9 +99,10 @@ def probe_runs(
     sources = check_unseen(paths, pack, tasks, weights, allow_leak=allow_leak or bool(session.folds))
     score = partial(_score, [*zip(paths, models, names, sources, strict=True)], runs, modalities, session)
     if session.folds:
-        (records, tested), retrieval = _in_folds(score, pack, others, tasks, session.folds, sources), []
+        (records, tested), retrieval = _in_folds(score, pack, others, tasks, session, sources), []
     else:
-        (records, retrieval), tested = score(pack, others, tasks), _unlearned([(t, [pack]) for t in tasks])
+        records, retrieval = score(pack, others, tasks)
+        tested = _tested([(task, [pack]) for task in tasks], session.fractions)
     leaks = [*leaks_of(every := [*records, *retrieval]), *([] if session.folds else mark_split_leaks(pack, every))]
     classes = {task.name: list(task.classes) for task in tasks if isinstance(task, Task)}
     result = {
@@ -175,11 +177,11 @@ def _in_folds(
     pack: Pack,
     others: Sequence[Bound],
     tasks: Sequence[AnyTask],
-    num: int,
+    session: ProbeConfig,
     sources: Sequence[list[Source] | None],
 ) -> tuple[Records, list[str]]:
     """Probe records of all folds, pooled, and notes on them. There is no retrieval: too few groups to search in."""
-    learned = [source for several in sources for source in several or ()]
+    learned, num = [source for several in sources for source in several or ()], session.folds
     splits = [(task, [{task.split: s.tolist()} for s in fold_splits(pack, task, num, learned)]) for task in tasks]
     folds: list[Records] = []
     for k in range(num):
@@ -191,7 +193,8 @@ def _in_folds(
             except ValueError as error:
                 raise ValueError(f"fold {k + 1} of {num}: {error}; give other --folds") from None
     tested = f"{num} folds: every {pack.spec.group_by} that no run learned from is tested once"
-    return pool(folds), [tested, *_unlearned([(task, map(pack.with_splits, cells)) for task, cells in splits])]
+    views = [(task, map(pack.with_splits, cells)) for task, cells in splits]
+    return pool(folds), [tested, *_tested(views, session.fractions)]
 
 
 def as_trained(model: Model, pack: Pack) -> Pack:
@@ -218,12 +221,16 @@ def noted(pack: Pack, paths: Sequence[Path]) -> Pack:
     return pack
 
 
-def _unlearned(views: Iterable[tuple[AnyTask, Iterable[Pack]]]) -> list[str]:
-    """A line for each task with test rows, of any fold, of classes that no probe learns: all answers for them are wrong."""
+def _tested(views: Iterable[tuple[AnyTask, Iterable[Pack]]], fractions: Sequence[float]) -> list[str]:
+    """Lines on test rows of classes that no probe learns, for which all answers are wrong, and on raised ``fractions``."""
     lines = []
-    for task, folds in ((task, folds) for task, folds in views if isinstance(task, Task)):
-        each = [(split_rows(fold, task), fold.labels(task.name)) for fold in folds]
-        new = np.concatenate([y[rows.test][~np.isin(y[rows.test], y[rows.fitted])] for rows, y in each])
+    for task, folds in views:
+        each = [(split_rows(fold, task), fold) for fold in folds]
+        lines += few_labels.raised(each[0][1], task, each[0][0].train, each[0][0].val, fractions)
+        if not isinstance(task, Task):
+            continue
+        known = [(rows, fold.labels(task.name)) for rows, fold in each]
+        new = np.concatenate([y[rows.test][~np.isin(y[rows.test], y[rows.fitted])] for rows, y in known])
         named, tested = ", ".join(task.classes[label] for label in np.unique(new)), sum(len(r.test) for r, _ in each)
         if named:
             lines.append(f"{task.name}: {len(new)} of {tested} test rows have classes that train lacks: {named}")
@@ -274,7 +281,7 @@ def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:
             asked: ProbeConfig = from_json(ProbeConfig, result["asked"], "asked")
             scored = {Path(r["run"]).resolve() for r in result["records"] if "run" in r}
             # Of one pack, the notes tell scores on val from those on test.
-            notes = [*pack.spec.notes, *_unlearned((task, [pack]) for task in pack.spec.all_tasks)]
+            notes = [*pack.spec.notes, *_tested([(task, [pack]) for task in pack.spec.all_tasks], asked.fractions)]
             same = (result["pack"], result["notes"], result["models"]) == (pack.digest, notes, _digests(paths))
     except ValueError as error:
         print(f"mvitac: {error}; the runs are probed again", file=sys.stderr)

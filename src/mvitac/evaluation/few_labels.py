@@ -1,5 +1,7 @@
 """Few labels: the linear probe fitted on a share of the labelled rows. Its kind is named by ``name``."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from mvitac.data.pack import Pack
@@ -16,6 +18,16 @@ def name(percent: float) -> str:
 def percent_of(kind: str) -> float:
     """The percentage of labels that a probe of ``kind`` sees; 0 for another kind."""
     return float(kind.removesuffix(ENDING)) if kind.endswith(ENDING) else 0.0
+
+
+def raised(pack: Pack, task: AnyTask, train: np.ndarray, val: np.ndarray, percents: Sequence[float]) -> list[str]:
+    """A line for each of ``percents`` that stands for more of the labels, as ``few`` keeps one of each class."""
+    lines, whole = [], len(train) + len(val)
+    for percent in percents:
+        num = sum(map(len, few(pack, task, train, val, percent, seed=0)))
+        if num > sum(round(percent / 100 * len(rows)) for rows in (train, val)):
+            lines.append(f"{task.name}: {name(percent)} is {num} of {whole} rows: each class or kind keeps one")
+    return lines
 
 
 def few(

@@ -131,7 +131,7 @@ def finetune(
     records = [record for own, _ in found.values() for record in own]
     result = {
         **{"data": pack.spec.name, "pack": pack.digest, "ancestor": str(ancestor), "group_by": pack.spec.group_by},
-        "notes": list(pack.spec.notes),
+        "notes": [*pack.spec.notes, *filter(None, map(job.raised, asked.fractions))],
         "leaks": [*leaks_of(records), *mark_split_leaks(pack, records)],
         "records": records,
         "chosen": {f"{percent:g}": settings for percent, (_, settings) in found.items()},
@@ -216,6 +216,13 @@ class _Job:
         except ValueError as error:
             return str(error)
         return ""
+
+    def raised(self, percent: float) -> str:
+        """That more groups are learned from than asked, as each class keeps one; "" if not."""
+        rows = (self.method(share, 0).training_rows(self.pack) for share in (percent, 100))
+        kept, whole = (len({*self.pack.column("group")[each]}) for each in rows)
+        text = f"{percent:g} % of {self.pack.spec.group_by}s is {kept} of {whole}: each class keeps one"
+        return text * (kept > round(percent / 100 * whole))
 
     def folder(self, percent: float, kind: str = "") -> Path:
         found = self.out if percent == 100 else self.out / f"{percent:g}-percent"

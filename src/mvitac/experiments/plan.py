@@ -75,8 +75,7 @@ class Plan:
         for name in [name for name in fixed if name in given]:
             raise ValueError(f"{name}: {fixed[name]}")
         folders = [slug(label).encode() for label in labels]
-        possible = all(folder and len(folder) < 200 for folder in folders)
-        if not possible or "*" in "".join(labels):  # of a control
+        if not all(folder and len(folder) < 200 for folder in folders) or "*" in "".join(labels):  # of a control
             how = "a label of letters or digits, under 200 bytes, without *"
             raise ValueError(f"plan {self.name!r}: give each row {how}")
         if taken := sorted(set(labels) & set(CONTROLS)):

@@ -71,8 +71,7 @@ class Recorder:
         buffer = io.BytesIO()
         np.savez(buffer, crop=self.crop, **arrays, **columns)  # type: ignore[arg-type]
         try:
-            if not self.spool.exists():
-                raise FileNotFoundError(0, "it was deleted or moved", self.spool)
+            self.spool.stat()  # if it was moved away, a new one would lack the parts before
             write_atomic(self.spool / f"{self.num:08d}.npz", lambda file: file.write(buffer.getvalue()))
         except OSError as error:
             if not self.failed:

@@ -50,14 +50,15 @@ class Step:
             torch.manual_seed(seed)
             with self.autocast():
                 losses = self.forward(chunks[0]())
-            if not isinstance(losses, dict) or getattr(losses.get("loss"), "ndim", 1):
-                raise ValueError(f"{type(self.method).__name__} returned no dict with a scalar tensor 'loss'")
-            losses["loss"].backward()
+            loss = losses.get("loss") if isinstance(losses, dict) else None
+            if not isinstance(loss, Tensor) or loss.ndim or not loss.requires_grad:
+                raise ValueError(f"{type(self.method).__name__} returned no dict with a differentiable scalar 'loss'")
+            loss.backward()
         else:
             losses = self._backward_by_chunks(chunks, seed)
         self.optimiser.step()
         self.method.after_step(progress)
-        return {name: value.detach() for name, value in losses.items()}
+        return {name: torch.as_tensor(value).detach() for name, value in losses.items()}
 
     def autocast(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16)

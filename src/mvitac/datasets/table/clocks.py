@@ -127,7 +127,7 @@ def join(
             if not any(cells):
                 own, theirs = (f"{np.nanmin(t):.3f} to {np.nanmax(t):.3f} s" for t in (stamps, times[at]))
                 how = f"{name}:{column}+SECONDS shifts it, or write the times of each video into NAME_timestamps.csv"
-                raise ValueError(f"{file} has no time of the images, {theirs}, but {own}: {how}")
+                raise ValueError(f"{file} has no time within {tolerance:g} s of the images, {theirs}, but {own}: {how}")
             for i, row in zip(at, cells, strict=True):
                 made[i] = {c: cell for c, cell in row.items() if c != column}
                 for c in [c for c in images if made[i].get(c)]:

@@ -155,14 +155,11 @@ class Manifest:
 
 
 def text_of(value: Any) -> str:
-    """Return a cell as text, the same for each file format: whole numbers without '.0', NaN and null as ''.
-
-    Blanks around it are removed, but not those of a file's name: " 1.png" and "1.png" may both exist.
-    """
+    """Return a cell as text, the same for each file format: whole numbers without '.0', NaN and null as ''."""
     text = "" if value is None else str(value).strip()
     if text in NAN:
         return ""
-    if text.lower().endswith((*IMAGES, *VIDEOS)):
+    if text.lower().endswith((*IMAGES, *VIDEOS)):  # " 1.png" and "1.png" may both exist
         return str(value)
     # pandas writes an integer column with a missing value as 1.0, 2.0, ...: these are the classes 1 and 2.
     return re.sub(r"^(-?\d+)\.0+$", r"\1", text) if ".0" in text else text
