@@ -1,5 +1,6 @@
 """ROS bags, written by rosbags itself: image and wrench topics joined by time."""
 
+import sqlite3
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -155,6 +156,10 @@ def test_messages_that_are_not_there_are_told(tmp_path: Path) -> None:
 
 def test_a_bag_that_is_cut_or_no_file(tmp_path: Path) -> None:
     file = next(write_bag(tmp_path / "bag", StoragePlugin.SQLITE3, 0).glob("*.db3"))
+    with sqlite3.connect(file) as base:
+        base.execute("UPDATE messages SET timestamp = 'x' WHERE id < 9")
+    with pytest.raises(ValueError, match=r"bag cannot be read as a bag \('x' is no time stamp\)"):
+        RosbagConfig(path=tmp_path / "bag", touch=(GEL,)).source()
     file.write_bytes(file.read_bytes()[:-100])  # sqlite reads the end as zeros
     with pytest.raises(ValueError, match=r"db3 is cut off: fetch it again"):
         packed(RosbagConfig(path=tmp_path / "bag", touch=(GEL,)), tmp_path / "pack")

@@ -3,10 +3,13 @@
 import copy
 import os
 import shutil
+import sys
 import zipfile
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -25,7 +28,7 @@ from mvitac.system import files
 from mvitac.training import validation
 from mvitac.training.checkpoint import CHECKPOINT, PREVIOUS, restore
 from mvitac.training.loader import ImageLoader
-from mvitac.training.log import read_log
+from mvitac.training.log import open_loggers, read_log
 from mvitac.training.loop import Diverged, train
 from mvitac.training.sampler import combine_seeds, draw_positives, epoch_order
 from mvitac.training.step import Step
@@ -281,6 +284,18 @@ def test_which_rows_a_view_is_of(pack: Pack, positives: Any, num_views: int) -> 
         assert other["vision"] == other["touch"] == ([False] if positives == "same-image" else [False, True])
     else:
         assert other == {"vision": [False], "touch": [positives == "same-touch-pairs"]}
+
+
+def test_a_logger_that_fails_is_named_and_training_goes_on_once_it_works(
+    pack: Pack, smoke_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "wandb", wandb := Mock(init=Mock(side_effect=RuntimeError("no key"))))
+    for expected in (pytest.raises(ValueError, match="^--logger wandb: no key; mend it, .* --resume$"), nullcontext()):
+        with expected, open_loggers("wandb", tmp_path / "r", smoke(pack)) as loggers:
+            train(smoke(pack), tmp_path / "r", quiet=True, resume=True, loggers=loggers)
+        wandb.init.side_effect = None
+    assert wandb.log.call_args.kwargs == {"step": 8} and wandb.finish.call_count == 1
+    assert_equal_weights(smoke_run, tmp_path / "r")
 
 
 def test_learning_rate_schedules() -> None:

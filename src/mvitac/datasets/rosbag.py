@@ -160,6 +160,8 @@ def _placed(messages: Iterator[Any]) -> Iterator[tuple[Any, tuple[int, int], Any
     """Messages with when they were received in ns, and their number among those of the topic in the same ns."""
     last: dict[str, tuple[int, int]] = {}
     for connection, received, raw in messages:
+        if not isinstance(received, int):  # columns of SQLite have no types
+            raise TypeError(f"{received!r} is no time stamp")
         stamp, number = last.get(connection.topic, (received, -1))
         last[connection.topic] = place = (received, number + 1 if stamp == received else 0)
         yield connection, place, raw

@@ -14,7 +14,7 @@ from typing import Any
 from mvitac.data.pack import Pack
 from mvitac.registry import check_known, to_json
 from mvitac.run import Run
-from mvitac.system.files import check_ordinary, naming, parse_json, write_atomic
+from mvitac.system.files import brief, check_ordinary, naming, parse_json, write_atomic
 from mvitac.system.progress import say, shown, work
 
 Logger = Callable[[int, dict[str, float]], None]  # called with a step and the values logged at it
@@ -189,20 +189,23 @@ def open_loggers(name: str | None, out: Path, run: Run) -> Iterator[tuple[Logger
     except ImportError:
         raise ValueError(f"--logger {name} needs its library: pip install -e '.[{name}]' in mvitac's clone") from None
     started: list[Any] = []
+    board = name == "tensorboard"
 
     def send(step: int, values: dict[str, float]) -> None:
-        board = name == "tensorboard"
-        if not started:  # only now: a run that is refused must leave no files, since --out must be new
-            about = {"project": "mvitac", "name": out.name, "config": to_json(run)}
-            started.append(library.SummaryWriter(str(out / "tensorboard")) if board else library.init(**about))
-        if board:
-            for key, value in values.items():
-                started[0].add_scalar(key, value, step)
-        else:  # wandb and trackio have the same functions
-            library.log(values, step=step)
+        try:
+            if not started:  # only now: a run that is refused must leave no files, since --out must be new
+                about = {"project": "mvitac", "name": out.name, "config": to_json(run)}
+                started.append(library.SummaryWriter(str(out / "tensorboard")) if board else library.init(**about))
+            if board:
+                for key, value in values.items():
+                    started[0].add_scalar(key, value, step)
+            else:  # wandb and trackio have the same functions
+                library.log(values, step=step)
+        except Exception as error:  # each library has its own
+            raise ValueError(f"--logger {name}: {brief(error)}; mend it, or leave it out, and --resume") from None
 
     try:
         yield (send,)
     finally:
         for writer in started:
-            writer.close() if name == "tensorboard" else library.finish()
+            writer.close() if board else library.finish()
