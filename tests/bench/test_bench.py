@@ -21,7 +21,7 @@ from mvitac.bench.board import _page, gather, order_of, write_board
 from mvitac.bench.check import problems
 from mvitac.bench.encoder import About, describe, run_bench
 from mvitac.bench.external import open_model
-from mvitac.bench.result import FORMAT, VOLATILE, pinned_of, read_result, records_of, suite_of
+from mvitac.bench.result import FORMAT, pinned_of, read_result, records_of, suite_of
 from mvitac.bench.score import Reader, misfit
 from mvitac.bench.suite import find_suite, open_set, shipped
 from mvitac.cli.main import main
@@ -31,7 +31,7 @@ from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import features
 from mvitac.model import fresh
 from mvitac.system.files import digest
-from support.forged_packs import Change, put, seal
+from support.forged_packs import Change, changed, put, seal
 from support.pages import drawings
 from support.toy import toy_pack, with_columns
 
@@ -98,16 +98,6 @@ def results(root: Path, smoke_run: Path) -> list[Path]:
     toys, out = find_suite(str(root / "toys.toml")), root / "results"
     places = [str(smoke_run)], [RANDOM.format(5), RANDOM.format(6)]
     return [run_bench(place, toys, out, root, About()) for place in places]
-
-
-def changed(file: Path, out: Path, change: Any, *, signed: bool) -> Path:
-    """A copy of a result after ``change``; ``signed`` again, as someone would who wants to hide it."""
-    value = json.loads(file.read_text())
-    change(value)
-    if signed:
-        value["digest"] = digest({key: part for key, part in value.items() if key not in VOLATILE})
-    out.write_text(json.dumps(value))
-    return out
 
 
 def said(capsys: pytest.CaptureFixture[str], *words: object) -> str:
@@ -467,7 +457,7 @@ FORGED: dict[str, tuple[Change, str]] = {
 @pytest.mark.parametrize("kind", FORGED)
 def test_forgery_is_refused(kind: str, results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     change, words = FORGED[kind]
-    forged = changed(results[0], tmp_path / "a.json", change, signed=True)
+    forged = changed(results[0], tmp_path / "a.json", change)
     for command in ("check", "board"):
         assert re.search(words, said(capsys, "bench", command, forged)), command
 
@@ -485,26 +475,24 @@ def blind_pixels(value: dict[str, Any]) -> None:
 
 
 def test_rows_and_leaks_are_compared(results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    forged = changed(results[1], tmp_path / "a.json", more_spread, signed=True)
+    forged = changed(results[1], tmp_path / "a.json", more_spread)
     assert main(["bench", "check", str(forged)]) == 0
     assert "the control mean differs between" in said(capsys, "bench", "board", results[0], forged)
     nothing = partial(untrained_as, lambda a, b: a is b if "targets" in b else a["modality"] == "none")
-    assert main(["bench", "check", str(changed(results[1], tmp_path / "a.json", nothing, signed=True))]) == 0
-    forged = changed(results[1], tmp_path / "a.json", blind_pixels, signed=True)
+    assert main(["bench", "check", str(changed(results[1], tmp_path / "a.json", nothing))]) == 0
+    forged = changed(results[1], tmp_path / "a.json", blind_pixels)
     assert main(["bench", "check", str(forged)]) == 0
     shown = write_board([results[0], forged], tmp_path / "x.html").read_text().split("tasks that were not run")[0]
     assert "pattern: pixels of the result of " in shown and "differ from those shown" in shown
-    seen = put("encoder", "trained_on", value="ImageNet; toy stripes")
-    forged = changed(results[1], tmp_path / "a.json", seen, signed=True)
+    forged = changed(results[1], tmp_path / "a.json", put("encoder", "trained_on", value="ImageNet; toy stripes"))
     assert "its marks of leaks are not those of data trained on, Image" in said(capsys, "bench", "check", forged)
 
 
 def test_names_in_results_are_text(results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     title = put("encoder", "name", value="\x1b]0;owned\x07")
-    error = said(capsys, "bench", "check", changed(results[0], tmp_path / "b.json", title, signed=True))
+    error = said(capsys, "bench", "check", changed(results[0], tmp_path / "b.json", title))
     assert "control character" in error and "\x1b" not in error
-    evil = "<img src=http://198.51.100.7>"
-    file = changed(results[0], tmp_path / "a.json", put("encoder", "name", value=evil), signed=True)
+    file = changed(results[0], tmp_path / "a.json", put("encoder", "name", value="<img src=http://198.51.100.7>"))
     page = write_board([file], tmp_path / "x.html").read_text()
     assert "&lt;img src" in page and "<img src=http" not in page
 
@@ -533,7 +521,7 @@ def test_data_other_than_that_of_its_pins_is_refused(
         value["blocks"][0]["data"] = {**value["blocks"][2]["data"], "rows": rows["folded"]}
         value["suite"]["sets"][0]["forms"][0]["pins"] = value["blocks"][0]["data"]
 
-    forged = changed(results[0], tmp_path / "b.json", own_pins, signed=True)
+    forged = changed(results[0], tmp_path / "b.json", own_pins)
     assert "other rows, labels or splits than the suite" in said(capsys, "bench", "check", forged)
 
 
@@ -548,14 +536,14 @@ def test_an_encoder_of_one_sense_says_which_it_lacks(root: Path, tmp_path: Path)
 def test_results_of_other_suites_are_refused(
     results: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    older = changed(results[0], tmp_path / "a.json", put("suite", "seed", value=1), signed=True)
+    older = changed(results[0], tmp_path / "a.json", put("suite", "seed", value=1))
     assert "does not have the digest" in said(capsys, "bench", "check", older)
 
     def resigned(value: dict[str, Any]) -> None:
         value["suite"]["seed"] = 1
         value["suite_digest"] = suite.from_json(suite.Suite, value["suite"], "suite").digest()
 
-    other = changed(results[1], tmp_path / "b.json", resigned, signed=True)
+    other = changed(results[1], tmp_path / "b.json", resigned)
     assert "is of another suite" in said(capsys, "bench", "board", results[0], other)
     assert "bench one of them with --name" in said(capsys, "bench", "board", results[0], results[0])
 
@@ -564,7 +552,7 @@ def test_results_of_other_suites_are_refused(
         resigned(value)
 
     says = "is of another sim-v1 than sim-v3 of this version: run the bench again"
-    assert says in said(capsys, "bench", "check", changed(results[1], tmp_path / "old.json", of_v1, signed=True))
+    assert says in said(capsys, "bench", "check", changed(results[1], tmp_path / "old.json", of_v1))
     monkeypatch.setattr(suite, "SUITES", tmp_path)
     (tmp_path / "toys.toml").write_text(SUITE)
     assert main(["bench", "check", str(results[0])]) == 0
@@ -597,10 +585,10 @@ def test_another_encoder_does_not_replace_a_result(results: list[Path], root: Pa
         run_bench([RANDOM.format(6)], toys, results[0].parent, root, About(name=name))
     with pytest.raises(ValueError, match=r"is the result of .*, weights "):
         run_bench([str(smoke_run)], toys, results[0].parent, root, About(name=name.replace(" ", "-")))
-    changed(results[0], root / results[0].name, put("blocks", 0, "data", "rows", value="0" * 64), signed=True)
+    changed(results[0], root / results[0].name, put("blocks", 0, "data", "rows", value="0" * 64))
     with pytest.raises(ValueError, match="is the result on other data of stripes: move it"):
         run_bench([str(smoke_run)], toys, root, root, About())
-    changed(results[0], root / results[0].name, put("blocks", 0, "task", value="left"), signed=True)
+    changed(results[0], root / results[0].name, put("blocks", 0, "task", value="left"))
     with pytest.raises(ValueError, match="is the result on stripes: left, which is not run now: move it"):
         run_bench([str(smoke_run)], toys, root, root, About())
     with pytest.raises(ValueError, match="is the result of another suite 'toys'"):

@@ -12,7 +12,6 @@ import torch
 
 from mvitac.bench.encoder import About
 from mvitac.bench.external import open_model
-from mvitac.bench.result import VOLATILE
 from mvitac.cli.main import main
 from mvitac.control import result
 from mvitac.control.result import find_suite
@@ -20,7 +19,7 @@ from mvitac.control.servo import TASKS, Edge, Surface, presses, task_of, texture
 from mvitac.control.servo_rows import Condition, Episode, Servo
 from mvitac.control.suite import Row, rows_of, score
 from mvitac.system.files import digest
-from support.forged_packs import put
+from support.forged_packs import changed, put
 
 RANDOM = "external:timm/test_resnet,weights=random,size=32,seed={}"
 KINDS = [kind for task in TASKS.values() for kind in task.kinds]
@@ -176,24 +175,16 @@ CHANGES: dict[str, Callable[[dict[str, Any]], Any]] = {
 
 @pytest.mark.parametrize("why", CHANGES)
 def test_changed_results_are_refused(done: Path, tmp_path: Path, why: str) -> None:
-    value = json.loads(done.read_text())
-    CHANGES[why](value)
-    path = tmp_path / "changed.json"
-    path.write_text(json.dumps(value))
     with pytest.raises(ValueError, match=r"does not match its digest|this version reads 1"):
-        result.read_control(path)
-    value["digest"] = digest({key: part for key, part in value.items() if key not in VOLATILE})
-    path.write_text(json.dumps(value))
+        result.read_control(changed(done, tmp_path / "changed.json", CHANGES[why], signed=False))
     with pytest.raises(ValueError, match=why):
-        result.read_control(path)
+        result.read_control(changed(done, tmp_path / "changed.json", CHANGES[why]))
 
 
 def test_constant_features_are_no_copies(done: Path, tmp_path: Path) -> None:
-    value = json.loads(done.read_text())
-    value["rows"][0]["cells"] = value["rows"][BLIND]["cells"]
-    value["digest"] = digest({key: part for key, part in value.items() if key not in VOLATILE})
-    (path := tmp_path / "constant.json").write_text(json.dumps(value))
-    assert result.read_control(path)[1] == value
+    blind = json.loads(done.read_text())["rows"][BLIND]["cells"]
+    path = changed(done, tmp_path / "constant.json", put("rows", 0, "cells", value=blind))
+    assert result.read_control(path)[1] == json.loads(path.read_text())
 
 
 def measured(name: str, *rows: tuple[str, int | None, float]) -> dict[str, Any]:

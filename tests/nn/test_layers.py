@@ -34,13 +34,8 @@ def test_seeded_draws_what_the_seed_gives_while_another_thread_draws() -> None:
         begun[-1].start(), begun[-1].join()
         nn.init.trunc_normal_(kept)
         other = F.scaled_dot_product_attention(kept.view(1, 3, 3), kept.view(1, 3, 3), kept.view(1, 3, 3))
-        free = (
-            torch.randn(4),
-            torch.randint(9, (5,)),
-            torch.randint(2, 9, (5,)),
-            torch.randperm(9),
-            torch.rand_like(kept),
-        )
+        integers = torch.randint(9, (5,)), torch.randint(2, 9, (5,)), torch.randperm(9)
+        free = torch.randn(4), *integers, torch.rand_like(kept)
         return [first.weight, *free, F.dropout(kept), torch.bernoulli(kept.abs() / 2), other]
 
     begun: list[Thread] = []

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from mvitac.bench.result import VOLATILE
 from mvitac.system.files import digest, digest_file
 
 Spoil = Callable[[Path], object]
@@ -22,6 +23,16 @@ def put(*keys: str | int, value: Any) -> Change:
         inner[keys[-1]] = value(inner[keys[-1]]) if callable(value) else value
 
     return change
+
+
+def changed(file: Path, out: Path, change: Change, *, signed: bool = True) -> Path:
+    """A copy of a result after ``change``; ``signed`` again, as someone would who wants to hide it."""
+    value = json.loads(file.read_text())
+    change(value)
+    if signed:
+        value["digest"] = digest({key: part for key, part in value.items() if key not in VOLATILE})
+    out.write_text(json.dumps(value))
+    return out
 
 
 def edited(path: Path, keys: tuple[str, ...], value: Any) -> None:
