@@ -35,10 +35,9 @@ def parse(
     """
     argv = _for_both(argv)
     options: dict[str, Any] = {"args": list(argv), "prog": f"mvitac {prog}"}
+    options["description"] = inspect.cleandoc(description) or None  # None: the docstring
     if default is not None:
         options["default"] = default
-    if description:
-        options["description"] = inspect.cleandoc(description)
     boxed, shown = io.StringIO(), io.StringIO()
     try:
         with contextlib.redirect_stderr(boxed):

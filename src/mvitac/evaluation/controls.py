@@ -121,8 +121,7 @@ def label_controls(
                 answer = np.eye(len(task.classes))[np.bincount(pack.labels(task.name)[seen]).argmax()]
             else:
                 answer = np.nanmean(pack.values(task)[seen], axis=0)
-            guessed = np.tile(answer, (len(rows.test), 1))
-            found.append((guess, kind, probe.score_rows(pack, task, rows.test, guessed)))
+            found.append((guess, kind, probe.score_rows(pack, task, rows.test, np.tile(answer, (len(rows.test), 1)))))
         for name, columns in pack.spec.controls.items():
             x = np.stack([pack.column(column).astype(float) for column in columns], axis=1)
             if np.isfinite(x[whole]).all():  # else rows of a part of a mix that has no such control

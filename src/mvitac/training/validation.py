@@ -91,10 +91,8 @@ def _validate(model: Model, pack: Pack, run: Run, locked: Mapping[str, Tensor]) 
     held_out = len(val_rows) > 1
     rows = sample(val_rows, NUM_EVAL_VAL, rng) if held_out else train_rows[:NUM_EVAL_VAL]
     z = {m: read(m, rows) for m in model.encoders if m in modalities}
-    values: dict[str, float] = {}
-    for modality, features in z.items():
-        values[f"{modality}/std"] = diagnostics.spread(features)
-        values[f"{modality}/rankme"] = diagnostics.rank_me(features)
+    signs = {"std": diagnostics.spread, "rankme": diagnostics.rank_me}
+    values = {f"{m}/{name}": sign(found) for m, found in z.items() for name, sign in signs.items()}
     values["held-out rows"] = float(held_out * len(rows))
     cells = _linear(pack, train_rows, rows, {m: read(m, train_rows) for m in z}, z) if held_out else {}
     values |= {name: float(_scores(cell).mean()) for name, cell in cells.items()}
