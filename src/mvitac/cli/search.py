@@ -104,14 +104,10 @@ def find(argv: list[str]) -> None:
     target = options.target or next((m for m in model.encoders if m != options.source), options.source)
     query, background = _picture(options.image), _picture(options.background) if options.background else None
     rows, cosines = known.find(model, query, options.source, target, options.num, background=background)
-    found = [
-        {
-            "cosine": round(float(cosine), 6),
-            **{name: known.table.column(name)[row].as_py() for name in ("id", "group", "row")},
-            "labels": known.labels(row),
-        }
-        for row, cosine in zip(rows[0].tolist(), cosines[0], strict=True)
-    ]
+    found = []
+    for row, cosine in zip(rows[0].tolist(), cosines[0], strict=True):
+        about = {name: known.table.column(name)[row].as_py() for name in ("id", "group", "row")}
+        found.append({"cosine": round(float(cosine), 6), **about, "labels": known.labels(row)})
     lines = [[f"{o['cosine']:.3f}", o["id"], o["group"], *map(o["labels"].get, known.classes)] for o in found]
     table = tabulate(lines, ["cosine", "id", "group", *known.classes], disable_numparse=True)
     title = f"{options.source} -> {target} in {options.known}"

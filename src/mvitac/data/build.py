@@ -208,14 +208,9 @@ class _Partial:
                 path.unlink()
         table = self._table()
         write_atomic(folder / "samples.parquet", lambda file: pq.write_table(table, file))
-        meta = {
-            "format": FORMAT,
-            "format_version": FORMAT_VERSION,
-            "num": num,
-            "digests": {path.name: digest_file(path) for path in (folder / "samples.parquet", *self.files.values())},
-            "damaged": damaged,
-            **self.request,
-        }
+        digests = {path.name: digest_file(path) for path in (folder / "samples.parquet", *self.files.values())}
+        meta = {"format": FORMAT, "format_version": FORMAT_VERSION, "num": num, "digests": digests}
+        meta |= {"damaged": damaged, **self.request}
         write_json(folder / "pack.json", {**meta, "digest": digest(json.loads(json.dumps(meta)))})
         # In a file of its own, because packs of equal content must be byte-identical.
         write_json(folder / "provenance.json", provenance())

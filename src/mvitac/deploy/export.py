@@ -5,6 +5,7 @@ written file, opened again as on a robot.
 """
 
 import contextlib
+import functools
 import io
 import logging
 import timeit
@@ -68,11 +69,8 @@ def export(
                 quantise(partial / MODEL, list(graph.inputs), _examples(graph, pack))
         with work("checking the outputs of the export"):
             wanted = reference(model, graph, pack, rows)
-            runtime, call, report = _checked(
-                partial / MODEL,
-                config.precision,
-                lambda call: parity(graph, call, pack, rows, wanted, **config.tolerance),
-            )
+            check = functools.partial(parity, graph, pack=pack, rows=rows, wanted=wanted, **config.tolerance)
+            runtime, call, report = _checked(partial / MODEL, config.precision, check)
             report["size_mb"] = round((partial / MODEL).stat().st_size / 1e6, 2)
             report["latency_ms"] = latency(call, [pack.images[m][rows[:1]] for m in graph.modalities])
         # A few real inputs and the outputs of the trained model, which ``Engine`` repeats where it is opened.
