@@ -539,20 +539,16 @@ def test_results_of_other_suites_are_refused(
     older = changed(results[0], tmp_path / "a.json", put("suite", "seed", value=1))
     assert "does not have the digest" in said(capsys, "bench", "check", older)
 
-    def resigned(value: dict[str, Any]) -> None:
-        value["suite"]["seed"] = 1
+    def resigned(value: dict[str, Any], **fields: str) -> None:
+        value["suite"] |= {"seed": 1, **fields}
         value["suite_digest"] = suite.from_json(suite.Suite, value["suite"], "suite").digest()
 
     other = changed(results[1], tmp_path / "b.json", resigned)
     assert "is of another suite" in said(capsys, "bench", "board", results[0], other)
     assert "bench one of them with --name" in said(capsys, "bench", "board", results[0], results[0])
-
-    def of_v1(value: dict[str, Any]) -> None:
-        value["suite"]["name"] = "sim-v1"
-        resigned(value)
-
+    old = changed(results[1], tmp_path / "old.json", partial(resigned, name="sim-v1"))
     says = "is of another sim-v1 than sim-v3 of this version: run the bench again"
-    assert says in said(capsys, "bench", "check", changed(results[1], tmp_path / "old.json", of_v1))
+    assert says in said(capsys, "bench", "check", old)
     monkeypatch.setattr(suite, "SUITES", tmp_path)
     (tmp_path / "toys.toml").write_text(SUITE)
     assert main(["bench", "check", str(results[0])]) == 0

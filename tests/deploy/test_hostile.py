@@ -195,15 +195,12 @@ ARTIFACTS: dict[str, tuple[dict[str, Any], str]] = {
     "no numbers": ({"probes": {WEIGHT: torch.full((3, 64), torch.nan)}}, "not all finite float32"),
 }
 EXPORTS: dict[str, tuple[dict[str, Any], str]] = {
-    name: ({"about": change}, says)
-    for name, (change, says) in {
-        "no tolerance": (lambda about: about.pop("tolerance"), "is damaged"),
-        "no spread": (put("values", value={"force": [NO_SPREAD]}), "damaged.*edges and spread of n"),
-        "a class that is no text": (put("classes", "pattern", value=[1]), r"export\.json: classes\.pattern: expected"),
-        "no runtime": (put("runtime", value="x"), r"export\.json: runtime"),
-        "no inputs": (put("inputs", value={}), "cannot be run"),
-        "too few classes": (put("classes", "pattern", value=["a"]), "damaged.*classes of pattern"),
-    }.items()
+    "no tolerance": ({"about": lambda about: about.pop("tolerance")}, "is damaged"),
+    "no spread": ({"about": put("values", value={"force": [NO_SPREAD]})}, "damaged.*edges and spread of n"),
+    "class of no text": ({"about": put("classes", "pattern", value=[1])}, r"export\.json: classes\.pattern: expected"),
+    "no runtime": ({"about": put("runtime", value="x")}, r"export\.json: runtime"),
+    "no inputs": ({"about": put("inputs", value={})}, "cannot be run"),
+    "too few classes": ({"about": put("classes", "pattern", value=["a"])}, "damaged.*classes of pattern"),
 }
 FORGED = [("artifact", *each) for each in ARTIFACTS.values()] + [("onnx", *each) for each in EXPORTS.values()]
 

@@ -242,9 +242,8 @@ def test_runs_of_other_data_and_settings_are_no_seeds_of_one_another(runs: list[
     seeds, other = f"mvitac ({runs[0].parent.name})", "mvitac (colder)"
     assert {source: cell["seeds"] for source, cell in found.items()} == {seeds: [0, 1], other: [0]}
     assert [r.source for r in open_runs([colder, *runs])] == [other, seeds, seeds]
-    again = shutil.copytree(runs[0], tmp_path / "again")
     with pytest.raises(ValueError, match="the same run"):
-        probe_runs([*runs, again], session)
+        probe_runs([*runs, shutil.copytree(runs[0], tmp_path / "again")], session)
 
 
 def test_classes_that_train_lacks_are_named_below_the_scores(runs: list[Path], pack: Pack) -> None:

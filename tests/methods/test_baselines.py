@@ -138,9 +138,8 @@ def test_moco_contrasts_with_the_queue_then_fills_it() -> None:
     for modality, queue in method.queues.items():
         torch.testing.assert_close(queue.keys[:8], F.normalize(keys[modality], dim=1))
         assert torch.equal(queue.keys[8:], queues[modality][8:]) and int(queue.place) == 8
-    query = method.towers.state_dict()
     for name, value in method.key.state_dict().items():
-        q = query[name.replace(".module.", ".")]
+        q = method.towers.state_dict()[name.replace(".module.", ".")]
         expected = 0.999 * before[name] + 0.001 * q if value.is_floating_point() else q
         torch.testing.assert_close(value, expected, msg=name)
 

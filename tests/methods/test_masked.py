@@ -190,6 +190,5 @@ def test_other_trunks_and_views_of_one_patch_are_refused(name: str) -> None:
         config.build(spec, TINY)
     with pytest.raises(ValueError, match="needs a plain ViT, and trunk mvitac_tiny is a ResNet"):
         replace(run, method=config).check(spec, 100, 72)
-    small = replace(run, method=config, encoder=TINY_VIT, augment=replace(run.augment, size=8))
     with pytest.raises(ValueError, match=r"8 px are a single patch .*--augment\.size 16 or more"):
-        small.check(spec, 100, 72)
+        replace(run, method=config, encoder=TINY_VIT, augment=replace(run.augment, size=8)).check(spec, 100, 72)

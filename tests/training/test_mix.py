@@ -105,10 +105,9 @@ def test_a_loss_is_of_the_rows_that_have_its_modality(name: str) -> None:
         assert alone.keys() == {"loss", loss}
         torch.testing.assert_close(alone[loss], losses[loss])
         other.after_step(0.5)
-        state = method.state_dict()
         for key, value in other.state_dict().items():
             if f".{modality}." in f".{key}.":
-                torch.testing.assert_close(value, state[key], msg=key)
+                torch.testing.assert_close(value, method.state_dict()[key], msg=key)
 
 
 def test_inter_modal_losses_are_of_whole_pairs() -> None:
