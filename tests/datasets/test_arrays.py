@@ -202,8 +202,7 @@ def test_changes_of_the_file_are_noticed(tmp_path: Path) -> None:
     for name in ("gel", "force_n"):
         before = os.stat(path)
         with h5py.File(path, "r+") as file:
-            dataset: Any = file[name]
-            dataset[4] = 7
+            file[name][4] = 7
         os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 10**9))
         places.append(config.place())
         fingerprints.append(config.source().fingerprint())
@@ -214,8 +213,7 @@ def test_changes_of_the_file_are_noticed(tmp_path: Path) -> None:
 def test_a_damaged_chunk_costs_its_own_rows(tmp_path: Path) -> None:
     path = write(tmp_path / "a.h5", flat(gel=np.random.default_rng(0).integers(0, 256, (20, 16, 16, 3), np.uint8)))
     with h5py.File(path) as file:
-        gel: Any = file["gel"]
-        chunk = gel.id.get_chunk_info(3)  # rows 7 and 8
+        chunk = file["gel"].id.get_chunk_info(3)  # rows 7 and 8
     data = bytearray(path.read_bytes())
     data[chunk.byte_offset : chunk.byte_offset + chunk.size] = bytes(chunk.size)
     path.write_bytes(data)

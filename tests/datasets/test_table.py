@@ -194,15 +194,9 @@ def pressed(root: Path) -> Table:
     for i in range(24):
         base, empty = (60, 180)[i // 12], i % 12 < 2
         value = base + (2 * (i % 12) - 1 if empty else 5 * (i % 12) - 40)
-        row = {
-            "touch": picture(root / f"{i}.png", value).name,
-            "background": picture(root / f"own{i}.png", 50 + i).name,
-            "sensor": ("digit", "mini")[i // 12],
-            "phase": "empty" if empty else "press",
-            "label": "ab"[i % 2],
-            "value": value,
-        }
-        rows.append(row)
+        images = {"touch": picture(root / f"{i}.png", value), "background": picture(root / f"own{i}.png", 50 + i)}
+        row = {column: file.name for column, file in images.items()} | {"sensor": ("digit", "mini")[i // 12]}
+        rows.append(row | {"phase": "empty" if empty else "press", "label": "ab"[i % 2], "value": value})
     return rows
 
 

@@ -27,10 +27,6 @@ class Clock:
         return self.now
 
 
-def touching(t: float) -> bool:
-    return t % 3 >= 1
-
-
 class Rig(Source):
     """A noisy sensor whose picture brightens in contact; ``fault`` breaks it."""
 
@@ -51,7 +47,7 @@ class Rig(Source):
         if self.fault == "frozen":
             return self.picture
         image = self.base + self.rng.integers(0, 3, self.base.shape, dtype=np.uint8)
-        if touching(self.clock.now):
+        if self.clock.now % 3 >= 1:  # in contact
             image[8:24, 8:24] += 80
         self.picture = image[::2, ::2] if self.fault == "resolution" else image
         return self.picture
