@@ -49,9 +49,14 @@ def make_rows(root: Path) -> Table:
         for which, path in enumerate(images.values()):
             picture(root / path, colour(i, which), (20, 16))
         place = i // 3
-        side = "train" if place < 4 or place == 7 else "val" if place == 4 else "test"
-        about = {"material": ("wood", "metal")[place % 2] if place < 7 else "", "stiffness": (place * 2) % 12}
-        about |= {"object": f"{place:03d}", "seq": i % 3, "width": 1.5 * i, "side": side}
+        about = {
+            "material": ("wood", "metal")[place % 2] if place < 7 else "",
+            "stiffness": (place * 2) % 12,
+            "object": f"{place:03d}",
+            "seq": i % 3,
+            "width": 1.5 * i,
+            "side": "train" if place < 4 or place == 7 else "val" if place == 4 else "test",
+        }
         rows.append(images | about)
     return rows
 

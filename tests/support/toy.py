@@ -74,9 +74,15 @@ class Toy(Source):
             wave = (columns, rows, columns * rows)[category] * 60 + 90 + 60 * bright
             return np.clip(wave[:, :, None] + rng.normal(0, 8, (32, 32, channels)), 0, 255).astype(np.uint8)
 
-        group, split = f"{category}-{instance}", ("train", "train", "val", "test")[instance // 2 % 4]
-        columns = {"id": f"{item:04d}", "group": group, "touch_group": group, "split": split}
-        columns |= {"label_pattern": category, "label_bright": bright, "noise": float(rng.normal())}
+        columns = {
+            "id": f"{item:04d}",
+            "group": f"{category}-{instance}",
+            "touch_group": f"{category}-{instance}",
+            "split": ("train", "train", "val", "test")[instance // 2 % 4],
+            "label_pattern": category,
+            "label_bright": bright,
+            "noise": float(rng.normal()),
+        }
         if self.values:
             columns["frame"] = item // NUM_CLASSES % 2  # the two of an instance
             columns["level"] = float(90 + 60 * bright + rng.normal())

@@ -62,11 +62,14 @@ class ExportModule(nn.Module):
         self.probes = nn.ModuleList([r for r in model.probes.values() if r.info.modality == asked])
         infos: list[Any] = [r.info for r in self.probes]
         self.classes = {q.task: list(q.classes) for q in infos if isinstance(q, ProbeInfo)}
-        self.values: dict[str, list[dict[str, Any]]] = {}
-        for info in (q for q in infos if isinstance(q, ValueInfo)):
-            for t, e in zip(info.targets, info.errors, strict=True):
-                about = {"name": t.name, "unit": t.unit, "edges": list(e.edges), "spread": list(e.spread)}
-                self.values.setdefault(info.task, []).append(about)
+        self.values = {
+            q.task: [
+                {"name": t.name, "unit": t.unit, "edges": list(e.edges), "spread": list(e.spread)}
+                for t, e in zip(q.targets, q.errors, strict=True)
+            ]
+            for q in infos
+            if isinstance(q, ValueInfo)
+        }
         self.inputs = {m: (model.stored, model.stored, model.spec.channels(m)) for m in self.modalities}
         names = [*(f"embedding_{m}" for m in self.modalities), *(f"shared_{m}" for m in self.projectors)]
         self.outputs = (*names, *(output_of(r) for r in self.probes))  # type: ignore[arg-type]

@@ -372,9 +372,12 @@ class Rows(Source):
         return [len(item) for item in self._items]
 
     def fingerprint(self) -> dict[str, Any]:
-        options = {k: v for k, v in to_json(self._config).items() if k not in ("path", *KEEPING)}
-        reader = f"{self._config.name} {VERSION}"
-        return {"reader": reader, "title": self._spec.name, "manifest": self._digest, "options": options}
+        return {
+            "reader": f"{self._config.name} {VERSION}",
+            "title": self._spec.name,
+            "manifest": self._digest,
+            "options": {k: v for k, v in to_json(self._config).items() if k not in ("path", *KEEPING)},
+        }
 
     def stamps(self) -> list[int]:
         return self._stamps
