@@ -12,7 +12,16 @@ import pytest
 from PIL import Image
 
 from mvitac.cli.main import main
-from mvitac.control.ablate import Recorded, ablate, act, open_policy, read_episodes, suite_episodes, suite_policy
+from mvitac.control.ablate import (
+    Recorded,
+    ablate,
+    act,
+    open_policy,
+    read_episodes,
+    replacement,
+    suite_episodes,
+    suite_policy,
+)
 from mvitac.control.result import find_suite
 from mvitac.control.video import film, webp
 from mvitac.data.build import build
@@ -116,6 +125,13 @@ def test_each_replacement_gives_what_it_says(pack: Pack) -> None:
     assert np.abs(felt["10 frames ago"][:, 10:] - force[:, :-10]).max() < 1.5
     assert np.abs(felt["10 frames ago"][:, :11] - force[:, :1]).max() < 1.5
     assert felt["noise"].std() < force.std() / 5 and np.abs(felt["noise"].mean() - force.mean()) < 15  # it is cut at 0
+
+
+def test_mean_and_noise_are_of_all_frames() -> None:
+    images, rows = np.zeros((400, 8, 8, 3), np.uint8), [np.arange(200), np.arange(200, 400)]
+    images[::2] = 200  # as a lamp that flickers
+    given = [replacement(kind, images, rows)(0, 0, images[0]) for kind in ("mean frame", "noise")]
+    assert (given[0] == 100).all() and 80 < given[1].std() < 100
 
 
 def test_a_policy_may_change_its_images_in_place_and_fill_one_action() -> None:

@@ -207,6 +207,14 @@ def test_files_that_are_no_videos(made: dict[str, Path], tmp_path: Path) -> None
         (tmp_path / name).write_bytes(data)
         with pytest.raises(ValueError, match=rf"{name} cannot be read as a video .* damaged or cut off"):
             num_frames(tmp_path / name)
+    said = []
+    for cut in range(100, 3000, 100):  # what is lost may be shown before what is left
+        (end := tmp_path / f"{cut}.mkv").write_bytes(made["h264-mkv"].read_bytes()[:-cut])
+        try:
+            assert num_frames(end) and np.diff(video.frame_times(end)).max() < 0.06
+        except ValueError as error:
+            said.append("lacks frames after" in str(error))
+    assert any(said)
     (tmp_path / "part.mkv").write_bytes(made["h264-mkv"].read_bytes()[:-4000])
     with pytest.raises(ValueError, match=r"part\.mkv ends after \d\.\d s of 00:00:.*: it is cut off"):
         num_frames(tmp_path / "part.mkv")

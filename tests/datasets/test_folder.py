@@ -31,7 +31,7 @@ from mvitac.datasets.table.manifest import Manifest, read_manifest
 from mvitac.datasets.table.splits import assign_splits
 from mvitac.datasets.table.table import Rows
 from mvitac.system.files import cache_dir
-from support.videos import picture
+from support.videos import film, picture
 
 NUM = 24
 Table = list[dict[str, Any]]
@@ -49,14 +49,9 @@ def make_rows(root: Path) -> Table:
         for which, path in enumerate(images.values()):
             picture(root / path, colour(i, which), (20, 16))
         place = i // 3
-        about = {
-            "material": ("wood", "metal")[place % 2] if place < 7 else "",
-            "stiffness": (place * 2) % 12,
-            "object": f"{place:03d}",
-            "seq": i % 3,
-            "width": 1.5 * i,
-            "side": "train" if place < 4 or place == 7 else "val" if place == 4 else "test",
-        }
+        side = "train" if place < 4 or place == 7 else "val" if place == 4 else "test"
+        about = {"material": ("wood", "metal")[place % 2] if place < 7 else "", "stiffness": (place * 2) % 12}
+        about |= {"object": f"{place:03d}", "seq": i % 3, "width": 1.5 * i, "side": side}
         rows.append(images | about)
     return rows
 
@@ -532,6 +527,10 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
     ):
         FolderConfig(path=tmp_path / "lonely").source()
     (tmp_path / "half flat/touch/b").symlink_to(tmp_path / "lonely")
+    film(tmp_path / "rec/mon/gel.mp4", 10)
+    (tmp_path / "rec/tue").symlink_to(tmp_path / "lonely")
+    with pytest.raises(ValueError, match="rec/tue is a link to a folder"):
+        FolderConfig(path=tmp_path / "rec", touch=("gel",)).source()
     with pytest.raises(ValueError, match="touch/b is a link to a folder: put the folder in its place"):
         FolderConfig(path=tmp_path / "half flat").source()
 

@@ -45,7 +45,7 @@ KINDS = ("mean frame", *PLAUSIBLE, "noise")
 SMALL = 0.02  # standard deviations of the action; below this a policy does not react
 SAME = 1e-3  # standard deviations by which answers to the same images may differ, as a GPU's do
 MOST = 1e60  # below which lie actions: their squares, in any unit, are finite
-FRAMES = 200  # that the mean frame and the strength of noise are of
+FRAMES = 200  # read at a time
 
 
 @dataclass
@@ -236,9 +236,13 @@ def _given(call: Callable[[], Any], place: str) -> Any:
 
 def replacement(kind: str, images: Any, rows: Sequence[np.ndarray]) -> Callable[[int, int, np.ndarray], np.ndarray]:
     """What replaces an image: a function of the episode's number, its step, and the image of ``LAG`` steps ago."""
-    every = np.concatenate(rows)
-    some = np.asarray(images[np.sort(every[:: -(-len(every) // FRAMES)])], np.float32)
-    mean, spread = some.mean(0), some.std((0, 1, 2))
+    every = np.sort(np.concatenate(rows))
+    total, squares = 0.0, 0.0
+    for part in np.array_split(every, -(-len(every) // FRAMES)):
+        found = np.asarray(images[part], np.float64)
+        total, squares = total + found.sum(0), squares + (found**2).mean((1, 2)).sum(0)
+    mean: Any = total / len(every)
+    spread = np.sqrt(np.maximum(squares / len(every) - mean.mean((0, 1)) ** 2, 0))
 
     def give(number: int, step: int, ago: np.ndarray) -> np.ndarray:
         if kind == "mean frame":

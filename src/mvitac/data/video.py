@@ -225,9 +225,9 @@ def _read_packets(path: str, size: int, changed: int) -> Packets:
     with _opened(path) as (container, stream):
         avi, table = "avi" in container.format.name, getattr(stream, "index_entries", None)  # PyAV 15 has no table
         if table is not None and ("mp4" in container.format.name or (avi and len(table) == stream.frames)):
-            found = [(e.timestamp, e.pos, e.is_keyframe, e.is_discard) for e in table if e.size]
+            found = [(e.timestamp, e.pos, e.is_keyframe, e.is_discard, None) for e in table if e.size]
         else:
-            found = [(p.dts, p.pos, p.is_keyframe, p.is_discard) for p in container.demux(stream) if p.size]
+            found = [(p.dts, p.pos, p.is_keyframe, p.is_discard, p.pts) for p in container.demux(stream) if p.size]
         unit = float(stream.time_base or 0)
         told = re.fullmatch(r"(\d+):(\d+):([\d.]+)", stream.metadata.get("DURATION", ""))  # of a Matroska file
         if table is None and avi and len(found) != stream.frames:
@@ -236,15 +236,23 @@ def _read_packets(path: str, size: int, changed: int) -> Packets:
     times = [row[0] for row in found]
     late = next((i for i, dts in enumerate(times) if dts is not None), 0)
     times[:late] = [(times[late] or 0) - late + i for i in range(late)]
-    before = np.cumsum([0, *(not cut for *_, cut in found)])
+    before = np.cumsum([0, *(not cut for *_, cut, _ in found)])
     if not before[-1] or None in times or any(place is None for _, place, *_ in found):
         raise ValueError(f"{path} holds no frames that can be told apart: it is damaged, or convert it to mp4")
     dts, places = np.array(times, np.int64), np.array([row[1] for row in found], np.int64)
-    keys = np.flatnonzero([key for _, _, key, _ in found])
+    keys = np.flatnonzero([key for _, _, key, *_ in found])
     if (np.diff(dts) <= 0).any() and before[-1] < len(dts):
         raise ValueError(f"{path} is put together from pieces by an edit list: encode it again, ffmpeg -i IN OUT.mp4")
     if (np.diff(dts) <= 0).any() or not len(keys):
         raise ValueError(f"{path} has frames out of order or no key frame: it is damaged, or convert it to mp4")
     if told and dts[-1] * unit < 3600 * int(told[1]) + 60 * int(told[2]) + float(told[3]) - 1:
         raise ValueError(f"{path} ends after {dts[-1] * unit:.1f} s of {told[0]}: it is cut off, fetch it again")
+    # What a cut took is shown after dts[-1], maybe before frames that are left, whose numbers would be too low.
+    shown = np.sort([pts for *_, pts in found if pts is not None])
+    steps = np.diff(shown)
+    gaps = np.flatnonzero(steps > 1.5 * np.median(steps)) if len(steps) else steps
+    if len(gaps) and shown[gaps[0] + 1] > dts[-1]:  # else its rate varies anyway
+        end = f"{(shown[gaps[0]] + np.median(steps) / 2) * unit:.3f}"
+        how = f"fetch it again, or ffmpeg -i IN -t {end} OUT.mp4"
+        raise ValueError(f"{path} lacks frames after {end} s: it is cut off, {how}")
     return Packets(dts, places, keys, before)

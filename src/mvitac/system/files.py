@@ -73,7 +73,7 @@ def check_ordinary(path: Path) -> None:
 
 
 def walk(folder: Path) -> Iterator[Path]:
-    """Every path below ``folder``, hidden folders not entered; OSError if one cannot be read: ``rglob`` says nothing."""
+    """Every path below ``folder``, hidden folders not entered; errors for one that is a link or cannot be read."""
 
     def stop(error: OSError) -> None:
         raise error
@@ -81,6 +81,8 @@ def walk(folder: Path) -> Iterator[Path]:
     for place, folders, files in os.walk(folder, onerror=stop):
         yield from (Path(place, name) for name in (*folders, *files))
         folders[:] = [name for name in folders if not name.startswith(".")]
+        for link in (path for name in folders if (path := Path(place, name)).is_symlink()):
+            raise ValueError(f"{link} is a link to a folder: put the folder in its place, or take it away")
 
 
 def check_place(path: Path) -> None:

@@ -372,12 +372,9 @@ class Rows(Source):
         return [len(item) for item in self._items]
 
     def fingerprint(self) -> dict[str, Any]:
-        return {
-            "reader": f"{self._config.name} {VERSION}",
-            "title": self._spec.name,
-            "manifest": self._digest,
-            "options": {k: v for k, v in to_json(self._config).items() if k not in ("path", *KEEPING)},
-        }
+        options = {k: v for k, v in to_json(self._config).items() if k not in ("path", *KEEPING)}
+        reader = f"{self._config.name} {VERSION}"
+        return {"reader": reader, "title": self._spec.name, "manifest": self._digest, "options": options}
 
     def stamps(self) -> list[int]:
         return self._stamps
