@@ -297,7 +297,7 @@ def test_each_share_has_its_rows_and_one_of_each_class(pack: Pack) -> None:
         assert set(labels[rows.train[train]]) == set(labels[rows.val[val]]) == {0, 1, 2}
         assert len(set(train)) == len(train) == max(3, round(percent / 100 * len(rows.train)))
     assert not np.array_equal(few(pack, task, rows.train, rows.val, 10, seed=4)[0], drawn[10][0])
-    said = f"pattern: 1 % of labels is 6 of {len(rows.train) + len(rows.val)} rows: each class or kind keeps one"
+    said = f"pattern: 1 % of labels is 6 of {len(rows.train) + len(rows.val)} rows: each kind of label is kept"
     assert raised(pack, task, rows.train, rows.val, (1, 50)) == [said]
 
 

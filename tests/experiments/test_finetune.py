@@ -155,7 +155,7 @@ def test_a_rate_that_diverges_is_not_chosen(ancestor: Path, pack: Pack, tmp_path
 def test_a_share_that_is_raised_to_one_of_each_class_is_noted(ancestor: Path, pack: Pack, tmp_path: Path) -> None:
     asked = replace(ASKED, lr=(1e-3,), steps=(1,), fractions=(1.0, 100.0), from_scratch=False)
     notes = tune(ancestor, pack, tmp_path / "out", asked)["notes"]
-    assert [note for note in notes if " % " in note] == ["1 % of instances is 3 of 48: each class keeps one"]
+    assert [note for note in notes if " % " in note] == ["1 % of instances is 3 of 48, the fewest with every class"]
 
 
 def tried_in(folder: Path) -> dict[str, float]:

@@ -140,5 +140,4 @@ def _images_seen(model: Model, path: Path) -> int | None:
     started = run.init.digest or {run.encoder[m].weights for m in model.encoders} != {SCRATCH}
     if started or not (run.steps or (path / FILE).exists()):
         return None
-    steps = run.steps or run.num_steps(sum(len(source.ids) for source in read_sources(path) or ()))
-    return steps * run.batch_size
+    return (run.steps or run.num_steps(sum(len(source.ids) for source in read_sources(path) or ()))) * run.batch_size

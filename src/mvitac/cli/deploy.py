@@ -100,9 +100,8 @@ def export(argv: list[str]) -> None:
     rows += [[f"{name}, lowest cosine", "", f"{values['min']:.5f}"] for name, values in report["cosine"].items()]
     latency = "{p50} / {p99}".format(**report["latency_ms"])
     rows += [["size, MB", "", f"{report['size_mb']}"], ["latency of one pair, ms: p50 / p99", "", latency]]
-    pack = new or pack
-    print(text_table(f"{options.out}: checked on {report['num_rows']} rows of {pack.path}", ["", *both], rows))
-    if options.on or new:
+    print(text_table(f"{options.out}: checked on {report['num_rows']} rows of {(new or pack).path}", ["", *both], rows))
+    if options.on and not new and any(original for _, original, _ in rows):  # scores
         tested, others = pack.rows("test"), pack.rows("train", "val", "unlabelled")
         leak = Scored(pack).leak(read_sources(folder_of(options.model)), tested if len(tested) else others)
         if leak not in ("", UNKNOWN):

@@ -252,7 +252,7 @@ def _read_packets(path: str, size: int, changed: int) -> Packets:
     steps = np.diff(shown)
     gaps = np.flatnonzero(steps > 1.5 * np.median(steps)) if len(steps) else steps
     if len(gaps) and shown[gaps[0] + 1] > dts[-1]:  # else its rate varies anyway
-        end = f"{(shown[gaps[0]] + np.median(steps) / 2) * unit:.3f}"
+        end = f"{(shown[gaps[0]] - shown[0] + np.median(steps) / 2) * unit:.3f}"  # as -t counts
         how = f"fetch it again, or ffmpeg -i IN -t {end} OUT.mp4"
-        raise ValueError(f"{path} lacks frames after {end} s: it is cut off, {how}")
+        raise ValueError(f"{path} lacks frames after its first {end} s: it is cut off, {how}")
     return Packets(dts, places, keys, before)

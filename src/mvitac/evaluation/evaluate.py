@@ -193,8 +193,7 @@ def _in_folds(
             except ValueError as error:
                 raise ValueError(f"fold {k + 1} of {num}: {error}; give other --folds") from None
     tested = f"{num} folds: every {pack.spec.group_by} that no run learned from is tested once"
-    views = [(task, map(pack.with_splits, cells)) for task, cells in splits]
-    return pool(folds), [tested, *_tested(views, session.fractions)]
+    return pool(folds), [tested, *_tested(((t, map(pack.with_splits, c)) for t, c in splits), session.fractions)]
 
 
 def as_trained(model: Model, pack: Pack) -> Pack:

@@ -26,7 +26,7 @@ def raised(pack: Pack, task: AnyTask, train: np.ndarray, val: np.ndarray, percen
     for percent in percents:
         num = sum(map(len, few(pack, task, train, val, percent, seed=0)))
         if num > sum(round(percent / 100 * len(rows)) for rows in (train, val)):
-            lines.append(f"{task.name}: {name(percent)} is {num} of {whole} rows: each class or kind keeps one")
+            lines.append(f"{task.name}: {name(percent)} is {num} of {whole} rows: each kind of label is kept")
     return lines
 
 

@@ -88,9 +88,8 @@ def _check_row(plan: Plan, row: Row, pack: Pack) -> tuple[Pack, str]:
         raise ValueError(f"dataset {plan.data.name!r} has no {', '.join(missing)}")
     run = plan.run(row, plan.data, 0, pack.phased)
     own = pack if run.data == plan.data else run.data.open()
-    answers = [f"label_{task.name}" for task in pack.spec.tasks]
     values = [target.name for task in pack.spec.values for target in task.targets]
-    for name in ("id", "group", *pack.spec.split_columns, *answers, *values):
+    for name in ("id", "group", *pack.spec.split_columns, *(f"label_{task.name}" for task in pack.spec.tasks), *values):
         theirs = own.column(name) if name in own.table.column_names else np.zeros(0)
         if not np.array_equal(theirs, pack.column(name), equal_nan=theirs.dtype.kind == "f" and name in values):
             raise ValueError(f"its data {own.path} has another column {name} than {pack.path}: give the same samples")

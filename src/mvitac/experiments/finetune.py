@@ -218,10 +218,10 @@ class _Job:
         return ""
 
     def raised(self, percent: float) -> str:
-        """That more groups are learned from than asked, as each class keeps one; "" if not."""
+        """That more groups are learned from than asked, as every class is kept; "" if not."""
         rows = (self.method(share, 0).training_rows(self.pack) for share in (percent, 100))
         kept, whole = (len({*self.pack.column("group")[each]}) for each in rows)
-        text = f"{percent:g} % of {self.pack.spec.group_by}s is {kept} of {whole}: each class keeps one"
+        text = f"{percent:g} % of {self.pack.spec.group_by}s is {kept} of {whole}, the fewest with every class"
         return text * (kept > round(percent / 100 * whole))
 
     def folder(self, percent: float, kind: str = "") -> Path:

@@ -191,8 +191,15 @@ def open_loggers(name: str | None, out: Path, run: Run) -> Iterator[tuple[Logger
     started: list[Any] = []
     board = name == "tensorboard"
 
-    def send(step: int, values: dict[str, float]) -> None:
+    @contextmanager
+    def named() -> Iterator[None]:
         try:
+            yield
+        except Exception as error:  # each library has its own
+            raise ValueError(f"--logger {name}: {brief(error)}; mend it, or leave it out, and --resume") from None
+
+    def send(step: int, values: dict[str, float]) -> None:
+        with named():
             if not started:  # only now: a run that is refused must leave no files, since --out must be new
                 about = {"project": "mvitac", "name": out.name, "config": to_json(run)}
                 started.append(library.SummaryWriter(str(out / "tensorboard")) if board else library.init(**about))
@@ -201,11 +208,10 @@ def open_loggers(name: str | None, out: Path, run: Run) -> Iterator[tuple[Logger
                     started[0].add_scalar(key, value, step)
             else:  # wandb and trackio have the same functions
                 library.log(values, step=step)
-        except Exception as error:  # each library has its own
-            raise ValueError(f"--logger {name}: {brief(error)}; mend it, or leave it out, and --resume") from None
 
     try:
         yield (send,)
     finally:
         for writer in started:
-            writer.close() if board else library.finish()
+            with named():
+                writer.close() if board else library.finish()

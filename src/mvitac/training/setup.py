@@ -95,7 +95,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
 
 def check_start(asked: Run, out: Path) -> tuple[Run, torch.device]:
     """The run with the digest of its start weights, and its device; ValueError if a word of it or a file is wrong."""
-    from_json(Run, to_json(asked))
+    from_json(Run, to_json(asked))  # as whoever opens the finished run does
     for file in leaks.weights_files(asked) if not (out / "run.json").exists() else ():
         if not file.is_file():
             raise ValueError(f"weights {str(file)!r}: give imagenet, scratch, or a file that exists")
